@@ -1,0 +1,29 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find the physical parameters of a rope, cable, wire or hose from observed manipulations."""
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.calibration import CalibrationResult, Evaluation, calibrate
+from dlo_calibration.chain import Chain
+from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+from dlo_calibration.parameters import PARAMETERS, Parameter, ParameterSpace
+from dlo_calibration.simulator import Rollout, Simulator
+from dlo_calibration.trial import Goal, Trial
+
+__all__ = [
+    'PARAMETERS', 'Action', 'CalibrationResult', 'Chain', 'DloCalibrationError', 'Evaluation', 'Goal',
+    'Hand', 'InputError', 'Parameter', 'ParameterSpace', 'Rollout', 'SimulationError', 'Simulator',
+    'Trial', 'calibrate',
+]

@@ -1,0 +1,131 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Action: what hands did to a DLO, as time-stamped paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation, Slerp
+
+from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.errors import InputError
+
+MAXIMUM_HANDS = 8
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """
+    One gripper hand: which points it grips, and the path it moves on.
+
+    It closes at its first waypoint.  Between waypoints it moves on the shortest
+    path at constant speed.  One gripped point is a pin; two or more are a clamp:
+    they move as one rigid piece with the hand.
+
+    :param name: as on the wire, e.g. ``left_hand``.
+    :param grips: indices of the gripped points of the chain, at least one.
+    :param times: (k,) seconds since the start of the trial, increasing, k >= 1.
+    :param positions: (k, 3) [m].
+    :param orientations: (k, 4) unit quaternions x y z w; None for no rotation.
+    """
+
+    name: str
+    grips: tuple[int, ...]
+    times: Floats
+    positions: Floats
+    orientations: Floats = None  # type: ignore[assignment]  # no rotation; an array once built
+
+    def __post_init__(self) -> None:
+        thing = f'hand {self.name!r}'
+        times = frozen_array(np.atleast_1d(self.times))
+        positions = frozen_array(np.atleast_2d(self.positions))
+        count = len(times)
+        orientations = np.tile(NO_ROTATION, (count, 1)) if self.orientations is None \
+            else np.atleast_2d(np.array(self.orientations, dtype=float))
+        if not self.grips:
+            raise InputError(thing, 'no gripped point', 'at least one',
+                             'name the points of the chain that it holds')
+        if count == 0 or positions.shape != (count, 3) or orientations.shape != (count, 4):
+            raise InputError(
+                thing, f'{count} times, positions {positions.shape}, orientations {orientations.shape}',
+                'k times, (k, 3) positions and (k, 4) orientations', 'give one pose per waypoint')
+        if not (np.isfinite(times).all() and np.isfinite(positions).all()
+                and np.isfinite(orientations).all()):
+            raise InputError(thing, 'NaN or infinity in its path', 'finite numbers', 'correct the path')
+        if (np.diff(times) <= 0).any():
+            raise InputError(thing, 'waypoints whose times do not increase', 'increasing times',
+                             'sort the waypoints and remove repeated ones')
+        norms = np.linalg.norm(orientations, axis=1, keepdims=True)
+        if (norms < 0.5).any():
+            raise InputError(thing, 'a quaternion of length 0', 'a unit quaternion x y z w',
+                             'use 0 0 0 1 for a hand that does not turn')
+        object.__setattr__(self, 'grips', tuple(int(g) for g in self.grips))
+        object.__setattr__(self, 'times', times)
+        object.__setattr__(self, 'positions', positions)
+        object.__setattr__(self, 'orientations', frozen_array(orientations / norms))
+
+    @property
+    def start(self) -> float:
+        """When the hand closes, seconds since the start of the trial."""
+        return float(self.times[0])
+
+    @property
+    def end(self) -> float:
+        """When the hand arrives at its last waypoint [s]."""
+        return float(self.times[-1])
+
+    def poses(self, at: ArrayLike) -> tuple[Floats, Floats]:
+        """
+        Where the hand is at `at`, (m,) [s]; it rests before its path and after.
+
+        :returns: (m, 3) positions [m] and (m, 3, 3) rotation matrices since it closed.
+        """
+        times = np.clip(np.atleast_1d(np.asarray(at, dtype=float)), self.start, self.end)
+        positions = np.stack([np.interp(times, self.times, axis) for axis in self.positions.T], axis=1)
+        turns = Rotation.from_quat(self.orientations)
+        turned = Slerp(self.times, turns)(times) if len(self.times) > 1 else turns[np.zeros(len(times), int)]
+        return positions, (turned * turns[0].inv()).as_matrix()
+
+
+@dataclass(frozen=True)
+class Action:
+    """What up to eight hands did together."""
+
+    hands: tuple[Hand, ...]
+
+    def __post_init__(self) -> None:
+        hands = tuple(self.hands)
+        names = [hand.name for hand in hands]
+        if not 1 <= len(hands) <= MAXIMUM_HANDS:
+            raise InputError('action', f'{len(hands)} hands', f'1 to {MAXIMUM_HANDS}',
+                             'leave out the hands that hold nothing')
+        if len(set(names)) < len(names):
+            raise InputError('action', f'hands named {", ".join(names)}', 'different names',
+                             'give each hand a name of its own')
+        object.__setattr__(self, 'hands', hands)
+
+    @property
+    def start(self) -> float:
+        """When the first hand closes [s]."""
+        return min(hand.start for hand in self.hands)
+
+    @property
+    def end(self) -> float:
+        """When the last hand arrives [s]."""
+        return max(hand.end for hand in self.hands)

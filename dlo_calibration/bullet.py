@@ -1,0 +1,278 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The PyBullet engine: a rope in any PyBullet world, and trials simulated with it.
+
+The rope's nodes are spheres.  Each step, `rod` gives their velocities from the
+internal forces and gravity, `contact` keeps the rope from passing through
+itself, and Bullet does contact and friction with everything else.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Mapping, Sequence
+
+import numpy as np
+import pybullet
+
+from dlo_calibration.chain import Chain, Floats
+from dlo_calibration.contact import SelfContact
+from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
+from dlo_calibration.parameters import ASSUMED_DENSITY, GRAVITY
+from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.rollout import Settling, roll_out
+from dlo_calibration.simulator import Rollout
+from dlo_calibration.trial import Trial
+
+DEFAULT_NODES = 31
+ROPE_GROUP = 1 << 6  # collision group whose members do not collide with each other in Bullet
+NO_TURN = (0.0, 0.0, 0.0, 1.0)
+INERTIA = 1e6  # kg m^2: spheres slide, they do not roll
+
+
+class BulletRope:
+    """
+    A calibrated rope in a PyBullet world, beside robots and obstacles.
+
+    The world's own gravity and time step apply to it.  Friction with another
+    body is Bullet's product of both coefficients, so a table that the rope was
+    calibrated on has `lateralFriction` 1.  Call `step` in place of
+    `pybullet.stepSimulation`; or `before_step` and `after_step` around it.
+
+    :param client: id of the PyBullet client.
+    :param places: (N,) [m] of the nodes along the rope at rest, from 0, increasing.
+    :param points: (N, 3) [m] of the nodes at the start.
+    :param physical: physical values by parameter name, in SI units.
+    :param radius: [m] at which it touches other bodies; None: its self-collision radius.
+    :param velocities: (N, 3) [m/s] at the start; None: at rest.
+    :param group: collision group of its own, one bit; two ropes that should
+        touch each other need two.
+    """
+
+    def __init__(self, client: int, places: Floats, points: Floats, physical: Mapping[str, float], *,
+                 radius: float | None = None, velocities: Floats | None = None,
+                 group: int = ROPE_GROUP) -> None:
+        self._client = client
+        world = pybullet.getPhysicsEngineParameters(physicsClientId=client)
+        self.time_step: float = world['fixedTimeStep']
+        self._gravity = np.array([world[f'gravityAcceleration{axis}'] for axis in 'XYZ'])
+        self._radius = physical['self_collision'] if radius is None else radius
+        shape = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=self._radius,
+                                              physicsClientId=client)
+        #: PyBullet's body ids of the nodes, first to last
+        self.bodies: tuple[int, ...] = tuple(
+            pybullet.createMultiBody(
+                baseMass=1.0, baseCollisionShapeIndex=shape, basePosition=list(point),
+                useMaximalCoordinates=True, physicsClientId=client)
+            for point in np.asarray(points, dtype=float))
+        for body in self.bodies:
+            pybullet.setCollisionFilterGroupMask(body, -1, group, ~group, physicsClientId=client)
+        self.reset(places, points, physical, velocities)
+
+    @classmethod
+    def of(cls, client: int, chain: Chain, physical: Mapping[str, float], *, nodes: int = DEFAULT_NODES,
+           **rest: Any) -> BulletRope:
+        """Put a rope where an observed chain is."""
+        places = spread_places(np.array([0.0, chain.length]), nodes)
+        return cls(client, places, chain.resample(places), physical, **rest)
+
+    def reset(self, places: Floats, points: Floats, physical: Mapping[str, float],
+              velocities: Floats | None = None) -> None:
+        """Start anew, with other properties, without building anything in the world."""
+        assert len(places) == len(points) == len(self.bodies)
+        self._points = np.array(points, dtype=float)
+        self._velocities = np.zeros_like(self._points) if velocities is None else np.array(velocities)
+        self._support = np.zeros_like(self._points)
+        self._rod = Rod(np.diff(places), RodProperties(
+            bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
+            mass=physical['mass'], drag=physical['damping'],
+            internal_damping=physical['internal_damping']), self.time_step)
+        self._contact = SelfContact(places, physical['self_collision'], physical['friction'], self.time_step)
+        self._contact.start(self._points)
+        for body, mass, point in zip(self.bodies, self._rod.masses, self._points.tolist(), strict=True):
+            pybullet.changeDynamics(
+                body, -1, mass=mass, localInertiaDiagonal=[INERTIA] * 3, lateralFriction=physical['friction'],
+                restitution=0.0, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client)
+            pybullet.resetBasePositionAndOrientation(body, point, NO_TURN, physicsClientId=self._client)
+        self.hold(())
+
+    @property
+    def points(self) -> Floats:
+        """The nodes' positions now, (N, 3) [m]; a copy."""
+        return self._points.copy()
+
+    @property
+    def velocities(self) -> Floats:
+        """The nodes' velocities now, (N, 3) [m/s]; a copy."""
+        return self._velocities.copy()
+
+    @property
+    def held(self) -> tuple[int, ...]:
+        """The nodes that are held, in the order that targets are given in."""
+        return self._held
+
+    def hold(self, nodes: Sequence[int]) -> None:
+        """Hold exactly these nodes from now on; none: let go."""
+        self._held = tuple(dict.fromkeys(int(node) for node in nodes))
+        self._order = np.argsort(self._held)
+        self._rod.hold(self._held)
+        self._inverse_masses = 1 / self._rod.masses
+        self._inverse_masses[list(self._held)] = 0.0
+        self._targets = self._points[list(self._held)]
+
+    def step(self, targets: Floats | None = None) -> None:
+        """Take one step of the whole world; see `before_step`."""
+        self.before_step(targets)
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self.after_step()
+
+    def before_step(self, targets: Floats | None = None) -> None:
+        """
+        Give the nodes the velocities that internal forces and gravity cause.
+
+        :param targets: (h, 3) [m] where the held nodes are after the step;
+            None: where they were.
+        :raises SimulationError: where the rollout diverges.
+        """
+        held = list(self._held)
+        if targets is not None:
+            self._targets = np.array(targets)
+        follow = (self._targets - self._points[held]) / self.time_step
+        wanted = self._rod.velocities(self._points, self._velocities, self._gravity, follow[self._order])
+        wanted[held] = follow
+        wanted = self._contact.velocities(self._points, wanted, self._inverse_masses, self._support)
+        self._wanted = wanted
+        sent = wanted - self._gravity * self.time_step  # Bullet adds it again
+        client = self._client
+        for body, velocity in zip(self.bodies, sent.tolist()):
+            pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
+
+    def after_step(self) -> None:
+        """Take the positions and velocities that contacts left."""
+        client = self._client
+        for node, target in zip(self._held, self._targets.tolist()):
+            pybullet.resetBasePositionAndOrientation(self.bodies[node], target, NO_TURN, physicsClientId=client)
+        points = np.array([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
+                           for body in self.bodies])
+        self._velocities = (points - self._points) / self.time_step
+        self._support = self._velocities - self._wanted
+        self._points = points
+
+    def advance(self, targets: Floats) -> None:
+        """Take k steps; targets (k, h, 3) [m] of the held nodes after each."""
+        for target in targets:
+            self.step(target)
+
+    def remove(self) -> None:
+        """Take the rope out of the world."""
+        for body in self.bodies:
+            pybullet.removeBody(body, physicsClientId=self._client)
+
+
+class BulletSimulator:
+    """
+    Simulates trials in a PyBullet world of its own: the rope, and a table or none.
+
+    The world is built at the first trial and reset for every other.  The table
+    is placed so that the rope rests on it at the measured height, whatever
+    radius is tried, so that a radius neither kicks it up nor lets it fall.
+
+    :param table: whether there is a table.
+    :param table_height: [m].
+    :param nodes: of the rope.
+    :param time_step: [s].
+    :param stable_distance: see `Settling` [m].
+    :param stable_time: see `Settling` [s].
+    :param settle_limit: see `Settling` [s].
+    """
+
+    name = 'bullet'
+
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
+                 time_step: float = 0.005, stable_distance: float = Settling.distance,
+                 stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
+        self._table_height = table_height if table else None
+        self._nodes = nodes
+        self._time_step = time_step
+        self._settling = Settling(stable_distance, stable_time, settle_limit)
+        self._world: _World | None = None
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """
+        Simulate a trial with physical parameters by name (SI units).
+
+        :raises SimulationError: where the rollout diverges.
+        :raises InputError: where the trial grips more points than there are nodes.
+        """
+        layout = Layout.of(trial, self._nodes)
+        points = layout.points
+        touching = None
+        if self._table_height is not None:
+            touching = resting_level(trial, self._table_height)
+            if touching is None:
+                touching = self._table_height + physical['self_collision']
+            points = rest_on(points, touching)
+        if self._world is None:
+            self._world = _World(layout, physical, self._time_step)
+        rope = self._world.start(layout.places, points, layout.velocities, physical, touching)
+        return roll_out(trial, layout, rope, self._settling)
+
+    def close(self) -> None:
+        """End the PyBullet client; the next trial starts another."""
+        if self._world is not None:
+            self._world.close()
+            self._world = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the PyBullet client behind: it belongs to this process."""
+        return {**self.__dict__, '_world': None}
+
+
+class _World:
+    """A PyBullet client with a rope and a plane."""
+
+    SPHERE = 0.005  # m; the plane is placed to suit it
+    AWAY = -1e3  # m: where there is no table
+
+    def __init__(self, layout: Layout, physical: Mapping[str, float], time_step: float) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=time_step, numSolverIterations=10, deterministicOverlappingPairs=1,
+            warmStartingFactor=0.0,
+            physicsClientId=self._client)
+        pybullet.setGravity(0, 0, -GRAVITY, physicsClientId=self._client)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=self._client)
+        self._plane = pybullet.createMultiBody(0, shape, useMaximalCoordinates=True, physicsClientId=self._client)
+        pybullet.changeDynamics(self._plane, -1, lateralFriction=1.0, restitution=0.0,
+                                physicsClientId=self._client)
+        self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=self.SPHERE)
+
+    def start(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+              touching: float | None) -> BulletRope:
+        """Place rope and table; `touching` [m] is the height of the rope's middle on the table."""
+        height = self.AWAY if touching is None else touching - self.SPHERE
+        # Bullet keeps contact points from step to step; a step without any forgets the last trial's.
+        self._place_table(self.AWAY)
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self._place_table(height)
+        self._rope.reset(places, points, physical, velocities)
+        return self._rope
+
+    def _place_table(self, height: float) -> None:
+        pybullet.resetBasePositionAndOrientation(self._plane, [0, 0, height], NO_TURN,
+                                                 physicsClientId=self._client)
+
+    def close(self) -> None:
+        pybullet.disconnect(physicsClientId=self._client)

@@ -1,0 +1,185 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Options: declared once, here.
+
+ROS parameters with descriptors and ranges, command-line flags, and the options
+recorded in a session are all generated from these declarations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Iterator, Mapping
+
+from dlo_calibration.calibration import PAPER_EVALUATIONS
+from dlo_calibration.errors import InputError
+from dlo_calibration.parameters import BY_NAME, PAPER_PARAMETERS, PARAMETERS, SCALE, ParameterSpace
+from dlo_calibration.search import SEARCHES
+
+ENGINES = ('bullet',)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """
+    One option, as ROS and the command line need to know it.
+
+    :param default: its type is the option's type (bool, int, float, str, or a
+        tuple of str).
+    :param choices: the values that a str, or each of a tuple of str, may have.
+    """
+
+    name: str
+    default: Any
+    description: str
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def checked(self, value: Any) -> Any:
+        """
+        Return `value` in the option's own type.
+
+        :raises InputError: where it has another type, or is out of range.
+        """
+        kind = type(self.default)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if kind is tuple and isinstance(value, (list, tuple)):
+            value = tuple(value)
+        what = f'parameter {self.name}'
+        if type(value) is not kind or kind is tuple and not all(isinstance(v, str) for v in value):
+            names = {bool: 'true or false', int: 'an integer', float: 'a number', str: 'a text',
+                     tuple: 'a list of names'}
+            raise InputError(what, f'{value!r}', names[kind], 'give it that type')
+        if self.choices:
+            for one in value if kind is tuple else (value,):
+                if one not in self.choices:
+                    raise InputError(what, f'{one!r}', f'one of {", ".join(self.choices)}', 'choose one of them')
+        low, high = self.minimum, self.maximum
+        if kind in (int, float) and not (
+                (low is None or value >= low) and (high is None or value <= high)):
+            raise InputError(what, f'{value:g} {self.unit}'.rstrip(),
+                             f'{"" if low is None else f"{low:g}"} to {"" if high is None else f"{high:g}"}'
+                             f' {self.unit}'.rstrip(), 'choose a value in that range')
+        return value
+
+
+def _option(default: Any, description: str, **rest: Any) -> Any:
+    return field(default=default, metadata={'description': description, **rest})
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Everything that a user can set; see the declarations for meaning, unit and range.
+
+    `values` holds, for every parameter of the table but the mass, its value on
+    the 0..100 scale where it is not calibrated; each is an option of its own.
+    """
+
+    mass: float = _option(
+        0.0, 'mass of the whole DLO; 0: not known, an assumed density is used and stiffnesses '
+        'are reported per weight', unit='kg', minimum=0.0, maximum=1000.0)
+    table: bool = _option(True, 'there is a table')
+    table_height: float = _option(0.0, 'height of the table', unit='m', minimum=-100.0, maximum=100.0)
+    calibrate: tuple[str, ...] = _option(
+        PAPER_PARAMETERS, 'names of the parameters to find; the others keep their value',
+        choices=tuple(BY_NAME))
+    search: str = _option('random', 'search method', choices=tuple(SEARCHES))
+    evaluations: int = _option(PAPER_EVALUATIONS, 'parameter sets to try at most (the paper\'s rounds)',
+                               minimum=1, maximum=1000000)
+    seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
+    engine: str = _option('bullet', 'simulation engine', choices=ENGINES)
+    workers: int = _option(0, 'number of processes that simulate; 0: one per core', minimum=0, maximum=1024)
+    nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
+    time_step: float = _option(0.005, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
+    stable_distance: float = _option(
+        0.001, 'a DLO is stable when all its points moved less than this within stable_time',
+        unit='m', minimum=1e-6, maximum=0.1)
+    stable_time: float = _option(0.25, 'see stable_distance', unit='s', minimum=0.01, maximum=60.0)
+    settle_limit: float = _option(10.0, 'give up waiting for a stable DLO after that long (simulated)',
+                                  unit='s', minimum=0.1, maximum=600.0)
+    grip_tolerance: float = _option(
+        0.02, 'an action without annotated grip is refused where no point is that near to the hand',
+        unit='m', minimum=0.0, maximum=10.0)
+    length_tolerance: float = _option(
+        50.0, 'a goal chain is refused where its length differs more from the initial one',
+        unit='%', minimum=0.0, maximum=1000.0)
+    release: bool = _option(
+        True, 'a hand opens at its last waypoint, where goal chains have no hand field that tells')
+    start_after_trials: int = _option(0, 'calibrate by itself after that many trials; 0: wait for ~/start',
+                                      minimum=0, maximum=1000000)
+    output_directory: str = _option('.', 'folder that the session and the result are written to')
+    record: bool = _option(True, 'record the session')
+    values: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for declaration in declarations():
+            if declaration.name in FIXED_VALUES:
+                continue
+            object.__setattr__(self, declaration.name, declaration.checked(getattr(self, declaration.name)))
+        given = {name: FIXED_VALUES[name].checked(value) if name in FIXED_VALUES else _unknown(name)
+                 for name, value in self.values.items()}
+        object.__setattr__(
+            self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> Options:
+        """
+        Build from a flat mapping of option names to values.
+
+        :raises InputError: for an unknown name, a wrong type, or a value out of range.
+        """
+        known = {declaration.name for declaration in declarations()}
+        for name in options:
+            if name not in known:
+                _unknown(name)
+        return cls(**{name: value for name, value in options.items() if name not in FIXED_VALUES},
+                   values={name: value for name, value in options.items() if name in FIXED_VALUES})
+
+    def flat(self) -> dict[str, Any]:
+        """Return all options by name, as `of` takes them; tuples as lists."""
+        flat = {d.name: self.values[d.name] if d.name in FIXED_VALUES else getattr(self, d.name)
+                for d in declarations()}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in flat.items()}
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The parameters to find, and where the others stay."""
+        return ParameterSpace(self.calibrate, self.values, self.mass)
+
+
+def _unknown(name: str) -> Any:
+    raise InputError('parameter', repr(name), f'one of {", ".join(d.name for d in declarations())}',
+                     'correct the name')
+
+
+FIXED_VALUES: Mapping[str, Declaration] = {
+    p.name: Declaration(
+        p.name, p.default, f'{p.description}: {p.quantity}, where it is not calibrated '
+        f'(0: {p.at_zero:.3g} {p.unit}, 100: {p.at_hundred:.3g} {p.unit}, logarithmic)',
+        minimum=0.0, maximum=SCALE)
+    for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg of its own
+
+
+def declarations() -> Iterator[Declaration]:
+    """Declare every option, in the order to show them."""
+    for option in fields(Options):
+        if option.name != 'values':
+            yield Declaration(option.name, option.default, **option.metadata)
+    yield from FIXED_VALUES.values()

@@ -1,0 +1,119 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Layout: where the nodes of the simulated DLO lie, and how observed points follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_calibration.action import Hand
+from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
+from dlo_calibration.errors import InputError
+from dlo_calibration.trial import Trial
+
+RESTING_BAND = 0.006  # m; points of a resting chain are that near to its lowest one
+RESTING_SHARE = 0.15  # of the points, at least, lie in the band of a chain that rests
+RESTING_HEIGHT = 0.04  # m above the table; beyond it a chain hangs
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Nodes of the simulated DLO.
+
+    :param places: (N,) [m] along the DLO at rest, from 0, increasing; every
+        gripped point has a node of its own.
+    :param points: (N, 3) [m] at the start.
+    :param velocities: (N, 3) [m/s] at the start.
+    :param observe: (n, N) weights; with the nodes' positions they give the observed points.
+    :param point_places: (n,) [m] of the observed points along the DLO.
+    """
+
+    places: Floats
+    points: Floats
+    velocities: Floats
+    observe: Floats
+    point_places: Floats
+
+    def nodes(self, hand: Hand) -> tuple[int, ...]:
+        """Return the nodes that a hand grips."""
+        return tuple(int(np.abs(self.places - self.point_places[grip]).argmin()) for grip in hand.grips)
+
+    @classmethod
+    def of(cls, trial: Trial, count: int) -> Layout:
+        """
+        Lay out `count` nodes, as equally spaced as the gripped points allow.
+
+        :raises InputError: where more points are gripped than there can be nodes.
+        """
+        initial = trial.initial
+        point_places = initial.arc_lengths()
+        grips = sorted({grip for hand in trial.hands for grip in hand.grips})
+        fixed = np.unique(np.concatenate([[0.0], point_places[grips], point_places[-1:]]))
+        if len(fixed) > count:
+            raise InputError(f'trial {trial.name!r}', f'{len(grips)} gripped points',
+                             f'fewer than the {count} nodes', 'raise the number of nodes')
+        places = spread_places(fixed, count)
+        observe = interpolation_matrix(places, point_places)
+        velocities = np.zeros((count, 3)) if trial.velocity is None else \
+            interpolation_matrix(point_places, places) @ trial.velocity
+        return cls(frozen_array(places), frozen_array(initial.resample(places)), frozen_array(velocities),
+                   frozen_array(observe), frozen_array(point_places))
+
+
+def spread_places(fixed: Floats, count: int) -> Floats:
+    """Return `count` increasing places that contain the `fixed` ones, the others evenly between."""
+    pieces = np.ones(len(fixed) - 1, int)
+    widths = np.diff(fixed)
+    while pieces.sum() < count - 1:
+        pieces[np.argmax(widths / pieces)] += 1
+    parts = [np.linspace(a, b, k, endpoint=False)
+             for a, b, k in zip(fixed[:-1], fixed[1:], pieces, strict=True)]
+    return np.append(np.concatenate(parts), fixed[-1])
+
+
+def resting_level(trial: Trial, table_height: float) -> float | None:
+    """
+    Return the height [m] of the middle of the DLO where it lies on the table.
+
+    That height is measured: the median over the lowest points of those chains
+    of the trial (at its start, and at rest) of which a part lies level just
+    above the table.  None where no chain does.
+    """
+    chains: list[Chain] = [trial.initial] if trial.velocity is None else []
+    chains += [goal.chain for goal in trial.goals if goal.stable]
+    levels = []
+    for chain in chains:
+        z = chain.points[:, 2]
+        lowest = z[z < z.min() + RESTING_BAND]
+        if len(lowest) >= max(3, RESTING_SHARE * len(z)):
+            levels.append(float(np.median(lowest)))
+    level = min(levels, default=np.inf)
+    return level if level - table_height < RESTING_HEIGHT else None
+
+
+def rest_on(points: Floats, level: float) -> Floats:
+    """
+    Return (N, 3) [m] points of which those that rest lie exactly at `level`.
+
+    Points below the level, or above it by less than the band that noise and
+    lying on the table explain, neither penetrate the table nor fall on it.
+    """
+    rested = np.array(points)
+    resting = rested[:, 2] < level + RESTING_BAND / 2
+    rested[resting, 2] = level
+    return rested

@@ -1,0 +1,163 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Parameters: the paper's 0..100 scale and the physical quantity behind each.
+
+Everything inside the package is in SI units; 0..100 exists here and at the
+edges (messages, files, tables).  Adding a parameter is one entry of PARAMETERS;
+an engine reads its physical value by name.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.errors import InputError
+
+SCALE = 100.0
+GRAVITY = 9.81  # m/s^2
+ASSUMED_DENSITY = 0.05  # kg/m, of a DLO whose mass is not known
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter of a DLO, on a logarithmic scale from 0 to 100.
+
+    :param at_zero: physical value at 0.
+    :param at_hundred: physical value at 100.
+    :param default: value on the 0..100 scale where it is not calibrated.
+    :param per_weight: True where only its ratio to the DLO's weight shows in
+        motion that gravity drives, so that without a known mass the ratio is reported.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    at_zero: float
+    at_hundred: float
+    default: float
+    description: str
+    per_weight: bool = False
+
+    def physical(self, value: float) -> float:
+        """Physical value of `value` on the 0..100 scale."""
+        return self.at_zero * math.pow(self.at_hundred / self.at_zero, value / SCALE)
+
+    def value(self, physical: float) -> float:
+        """Value on the 0..100 scale (beyond it too) of a physical value > 0."""
+        return SCALE * math.log(physical / self.at_zero) / math.log(self.at_hundred / self.at_zero)
+
+
+#: The paper's four, then what is fixed by default.
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**-1.0, 10**-5.5, 50.0,
+              'how easily the DLO bends', per_weight=True),
+    Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e1, 30.0,
+              'how easily the DLO stretches', per_weight=True),
+    Parameter('friction', 'Coulomb friction coefficient', '1', 10**-2.0, 10**0.3, 70.0,
+              'friction of the DLO on the table and on itself'),
+    Parameter('self_collision', 'self-collision radius', 'm', 2e-3, 3e-2, 25.0,
+              'radius at which parts of the DLO touch each other'),
+    Parameter('damping', 'drag per mass', '1/s', 1e-2, 1e2, 50.0,
+              'how fast motion through the air dies out'),
+    Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-5, 1e-1, 25.0,
+              'how fast bending and stretching vibrations die out'),
+    Parameter('mass', 'mass of the whole DLO', 'kg', 1e-3, 1e1, 42.0, 'mass of the whole DLO'),
+)
+BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """
+    Which parameters a calibration finds, and where the others stay.
+
+    :param free: names of the parameters to find, in order.
+    :param fixed: values of others on the 0..100 scale; those not named keep
+        their default.
+    :param mass: kg of the whole DLO; 0 where it is not known.
+    """
+
+    free: tuple[str, ...] = PAPER_PARAMETERS
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        free = tuple(self.free)
+        for name in (*free, *self.fixed):
+            if name not in BY_NAME:
+                raise InputError('parameter', repr(name), f'one of {", ".join(BY_NAME)}',
+                                 'correct the name')
+        if not free or len(set(free)) < len(free):
+            raise InputError('calibrate', str(list(free)), 'one or more different names',
+                             'name each parameter to find once')
+        for name, value in self.fixed.items():
+            if not 0 <= value <= SCALE:
+                raise InputError(f'parameter {name}', f'{value:g}', 'a value from 0 to 100',
+                                 'give it on the 0..100 scale')
+        object.__setattr__(self, 'free', free)
+        object.__setattr__(self, 'fixed', dict(self.fixed))
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters to find."""
+        return len(self.free)
+
+    @property
+    def mass_known(self) -> bool:
+        """Tell whether physical values can be given in absolute units."""
+        return self.mass > 0 or 'mass' in self.free
+
+    def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
+        """Return the free parameters, 0..100, of a (d,) point of the unit cube."""
+        return {name: float(u) * SCALE for name, u in zip(self.free, point, strict=True)}
+
+    def point(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the (d,) point of the unit cube of free parameters on 0..100."""
+        return np.array([values[name] / SCALE for name in self.free])
+
+    def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:
+        """
+        Return every parameter's physical value, by name.
+
+        :param values: free parameters on the 0..100 scale.
+        :param length: of the DLO [m], for the mass where that is not known.
+        """
+        physical = {p.name: p.physical(values.get(p.name, self.fixed.get(p.name, p.default)))
+                    for p in PARAMETERS}
+        if 'mass' not in values and 'mass' not in self.fixed:
+            physical['mass'] = self.mass if self.mass > 0 else ASSUMED_DENSITY * length
+        return physical
+
+    def reported(self, name: str, value: float) -> tuple[float, str]:
+        """
+        Return the physical value to report for `value` on 0..100, and its unit.
+
+        Where the mass is not known, a stiffness is given divided by the DLO's
+        weight per length, which is what gravity-driven motion determines.
+        """
+        parameter = BY_NAME[name]
+        physical = parameter.physical(value)
+        if parameter.per_weight and not self.mass_known:
+            return physical / (ASSUMED_DENSITY * GRAVITY), f'{parameter.unit} per N/m'
+        return physical, parameter.unit

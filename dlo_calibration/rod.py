@@ -1,0 +1,192 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Rod: the internal forces of the mass-spring chain, integrated implicitly.
+
+Point masses in a line.  Stretching springs of stiffness ``EA / l`` join
+neighbours, bending has the energy ``EI / (2 l) |t_i - t_(i-1)|^2`` at each inner
+node, with t the segment vectors divided by their rest length (the discrete
+curvature of Bergou et al., Discrete Elastic Rods, 2008, without twist).  A step
+is the linearised backward Euler of Baraff and Witkin, Large Steps in Cloth
+Simulation, 1998, equation 6, with the part of the stretching Hessian that a
+compressed spring makes negative left out, so that the matrix stays positive
+definite and any stiffness is stable at any time step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+import numpy as np
+from scipy.linalg import lapack
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.errors import SimulationError
+
+BANDS = 7  # diagonal and six below it: node i couples to i + 2, three coordinates each
+HELD = 1e12  # a held node's share of the matrix, relative to its mass
+
+
+@dataclass(frozen=True)
+class RodProperties:
+    """
+    Physical properties of a rod.
+
+    :param bending_stiffness: EI [N m^2].
+    :param stretching_stiffness: EA [N].
+    :param mass: of the whole rod [kg].
+    :param drag: acceleration against the velocity [1/s].
+    :param internal_damping: damping per stiffness [s].
+    """
+
+    bending_stiffness: float
+    stretching_stiffness: float
+    mass: float
+    drag: float = 0.0
+    internal_damping: float = 0.0
+
+
+class Rod:
+    """
+    A chain of N nodes whose velocities are stepped by its internal forces and gravity.
+
+    :param rest_lengths: (N - 1,) [m] of the segments; they need not be equal.
+    :param properties: see `RodProperties`.
+    :param time_step: [s].
+    :param rest_points: (N, 3) [m] shape in which bending is without force; None: straight.
+    """
+
+    def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
+                 rest_points: Floats | None = None) -> None:
+        n = len(rest_lengths) + 1
+        self._rest = rest_lengths
+        self._step = time_step
+        self._stiffness = (properties.stretching_stiffness / rest_lengths)[:, None]
+        weights = np.zeros(n)
+        weights[:-1] += rest_lengths / 2
+        weights[1:] += rest_lengths / 2
+        #: (N,) mass of each node [kg]
+        self.masses = properties.mass * weights / weights.sum()
+        self._properties = properties
+        self._rest_points = np.zeros((n, 3)) if rest_points is None else rest_points
+        self._implicit = time_step**2 + properties.internal_damping * time_step
+        self._places, self._signs = _stretching_places(n)
+        self.hold(())
+
+    def hold(self, nodes: Sequence[int]) -> None:
+        """
+        Let these nodes follow given velocities from now on, and no others.
+
+        A segment between two held nodes is rigid, so that the bending begins
+        at its end: exactly there a clamped DLO leaves its clamp.
+        """
+        self._held = np.array(sorted(nodes), int)
+        self._pull = HELD * self.masses[self._held]
+        held = np.isin(np.arange(len(self.masses)), self._held)
+        rigid = held[:-1] & held[1:]
+        self._bending = _bending_bands(self._rest, rigid, self._properties.bending_stiffness)
+        self._rest_force = self._bend(self._rest_points)
+        self._constant = np.zeros((BANDS, len(self.masses), 3))
+        self._constant[0] = (self.masses * (1 + self._properties.drag * self._step))[:, None]
+        for offset in range(3):
+            self._constant[3 * offset] += self._implicit * self._bending[offset][:, None]
+
+    @property
+    def held(self) -> np.ndarray:
+        """Indices of the held nodes."""
+        return self._held
+
+    def velocities(self, points: Floats, velocities: Floats, gravity: Floats,
+                   held_velocities: Floats) -> Floats:
+        """
+        Return the velocities (N, 3) [m/s] after one time step without contacts.
+
+        :param points: (N, 3) [m] now.
+        :param velocities: (N, 3) [m/s] now.
+        :param gravity: (3,) [m/s^2].
+        :param held_velocities: (h, 3) [m/s] of the held nodes, in the order of `held`.
+        :raises SimulationError: where the points are no longer finite.
+        """
+        step = self._step
+        segments = points[1:] - points[:-1]
+        squares = np.einsum('ij,ij->i', segments, segments)
+        lengths = np.sqrt(squares)
+        slack = (1 - self._rest / lengths)[:, None]
+        tensions = self._stiffness * slack * segments
+        forces = self._rest_force - self._bend(points)
+        forces[:-1] += tensions
+        forces[1:] -= tensions
+        right = self.masses[:, None] * (velocities + step * gravity) + step * forces
+
+        across = np.maximum(slack, 0) * self._stiffness
+        along = (self._stiffness - across) / squares[:, None]
+        blocks = (along * segments)[:, :, None] * segments[:, None, :]
+        blocks[:, (0, 1, 2), (0, 1, 2)] += across
+        blocks *= self._implicit
+        diagonal = np.zeros((len(points), 3, 3))
+        diagonal[:-1] = blocks
+        diagonal[1:] += blocks
+        bands = self._constant.ravel().copy()
+        bands[self._places] += self._signs * np.concatenate(
+            [diagonal[:, _ROWS, _COLUMNS].ravel(), blocks.ravel()])
+        bands = bands.reshape(BANDS, -1, 3)
+        bands[0, self._held] += self._pull[:, None]
+        right[self._held] += self._pull[:, None] * held_velocities
+        _, solution, info = lapack.dpbsv(bands.reshape(BANDS, -1), right.ravel(), lower=1,
+                                         overwrite_ab=1, overwrite_b=1)
+        if info != 0 or not np.isfinite(solution).all():
+            raise SimulationError('the rollout diverged: the chain is no longer finite')
+        return np.asarray(solution).reshape(-1, 3)
+
+    def _bend(self, points: Floats) -> Floats:
+        """Multiply (N, 3) with the bending matrix."""
+        diagonal, first, second = self._bending
+        product = diagonal[:, None] * points
+        product[:-1] += first[:-1, None] * points[1:]
+        product[1:] += first[:-1, None] * points[:-1]
+        product[:-2] += second[:-2, None] * points[2:]
+        product[2:] += second[:-2, None] * points[:-2]
+        return product
+
+
+_ROWS, _COLUMNS = (np.array(indices) for indices in ((0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 1, 0)))
+
+
+def _bending_bands(rest_lengths: Floats, rigid: np.ndarray, stiffness: float) -> Floats:
+    """Bending matrix (N, N), symmetric: its diagonal and the two below it, (3, N)."""
+    n = len(rest_lengths) + 1
+    before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]
+    row = np.stack([before, -(before + after), after])  # curvature of node i from i - 1, i, i + 1
+    bendable = np.where(rigid, 0.0, rest_lengths)
+    cells = (bendable[:-1] + bendable[1:]) / 2  # of the DLO, bent at each inner node
+    row *= np.sqrt(np.divide(stiffness, cells, out=np.zeros_like(cells), where=cells > 0))
+    bands = np.zeros((3, n))
+    for a in range(3):
+        for b in range(a + 1):
+            bands[a - b, b:n - 2 + b] += row[a] * row[b]
+    return bands
+
+
+def _stretching_places(n: int) -> tuple[np.ndarray, Floats]:
+    """Where stretching blocks go in the flat (BANDS, N, 3) lower bands, and with which sign."""
+    def place(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return (row - column) * 3 * n + column
+
+    nodes = 3 * np.arange(n)[:, None]
+    same = place(nodes + _ROWS, nodes + _COLUMNS).ravel()
+    rows, columns = np.divmod(np.arange(9), 3)
+    next_ = place(nodes[:-1] + 3 + rows, nodes[:-1] + columns).ravel()
+    return np.concatenate([same, next_]), np.concatenate([np.ones(len(same)), -np.ones(len(next_))])

@@ -1,0 +1,213 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+roll_out(): the course of a simulated trial, the same for every engine.
+
+Hands close, move and open; timed goals are compared at their instant; where a
+goal is a stable configuration, time goes on until the DLO has come to rest.
+Times in which nothing happens any more are skipped.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from dlo_calibration.action import Hand
+from dlo_calibration.chain import Floats
+from dlo_calibration.layout import Layout
+from dlo_calibration.simulator import Rollout
+from dlo_calibration.trial import Goal, Trial
+
+CHECKS = 5  # of the displacement within one stable_time
+ROUNDING = 1e-9  # s
+
+
+@dataclass(frozen=True)
+class Settling:
+    """
+    When a DLO counts as stable.
+
+    :param distance: all points moved less than that [m]
+    :param time: within that time [s], hands at rest;
+    :param limit: after that long [s] it is given up.
+    """
+
+    distance: float = 0.001
+    time: float = 0.25
+    limit: float = 10.0
+
+
+class Stepper(Protocol):
+    """An engine's simulated DLO, placed at the start of a trial."""
+
+    time_step: float
+
+    @property
+    def points(self) -> Floats:
+        """The (N, 3) [m] nodes now."""
+
+    def hold(self, nodes: tuple[int, ...]) -> None:
+        """Let exactly these nodes follow a path from now on."""
+
+    def advance(self, targets: Floats) -> None:
+        """
+        Take k steps.
+
+        :param targets: (k, h, 3) [m] where the held nodes are after each step.
+        """
+
+
+def roll_out(trial: Trial, layout: Layout, stepper: Stepper, settling: Settling) -> Rollout:
+    """
+    Simulate a trial on a stepper that is at its start.
+
+    :raises SimulationError: where the rollout diverges.
+    """
+    return _Course(trial, layout, stepper, settling).rollout()
+
+
+@dataclass
+class _Grip:
+    hand: Hand
+    nodes: tuple[int, ...]
+    offsets: Floats  # of the nodes from the hand as it closed
+
+
+class _Course:
+    def __init__(self, trial: Trial, layout: Layout, stepper: Stepper, settling: Settling) -> None:
+        self._trial = trial
+        self._layout = layout
+        self._stepper = stepper
+        self._settling = settling
+        self._time = 0.0  # of the trial
+        self._steps = 0
+        self._grips: dict[str, _Grip] = {}
+        self._waiting = sorted(trial.hands, key=lambda hand: hand.start)
+        self._hold()
+
+    def rollout(self) -> Rollout:
+        """Go from goal to goal."""
+        chains, settled = [], []
+        for goal in self._trial.goals:
+            if goal.stable:
+                self._act_until(goal.time)
+                self._open(goal)
+                settled.append(self._settle(self._settling.limit))
+                self._time = max(self._time, goal.time)
+                chains.append(self._observed(self._stepper.points))
+            else:
+                chains.append(self._observed(self._points_at(goal.time)))
+                settled.append(True)
+        return Rollout(np.array(chains), tuple(settled), self._steps * self._stepper.time_step, self._steps)
+
+    def _observed(self, points: Floats) -> Floats:
+        return self._layout.observe @ points
+
+    def _points_at(self, instant: float) -> Floats:
+        """Go on to an instant; between two steps, interpolate."""
+        step = self._stepper.time_step
+        self._act_until(instant - step)
+        before, start = self._stepper.points, self._time
+        while self._time < instant - ROUNDING:
+            before, start = self._stepper.points, self._time
+            self._close()
+            self._advance(1)
+            self._open_arrived()
+        share = (instant - start) / (self._time - start) if self._time > start else 0.0
+        return before + np.clip(share, 0, 1) * (self._stepper.points - before)
+
+    def _act_until(self, until: float) -> None:
+        """Let hands act until then; where none moves, go on at most until the DLO is at rest."""
+        while self._time < until - ROUNDING:
+            self._close()
+            ends = [grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+            starts = [hand.start for hand in self._waiting if hand.start < until]
+            target = min([*ends, *starts, until])
+            if ends or not self._nothing_timed_before(target):
+                self._advance(max(1, math.ceil((target - self._time) / self._stepper.time_step - 1e-6)))
+            else:
+                self._settle(min(target - self._time, self._settling.limit))
+                self._time = max(self._time, target)
+            self._open_arrived()
+
+    def _nothing_timed_before(self, instant: float) -> bool:
+        """Tell whether the time until then may be skipped: no goal is compared at an instant of it."""
+        return not any(not goal.stable and self._time < goal.time <= instant + self._stepper.time_step
+                       for goal in self._trial.goals)
+
+    def _close(self) -> None:
+        closing = [hand for hand in self._waiting if hand.start <= self._time + ROUNDING]
+        for hand in closing:
+            self._waiting.remove(hand)
+            nodes = self._layout.nodes(hand)
+            position = hand.poses(self._time)[0][0]
+            self._grips[hand.name] = _Grip(hand, nodes, self._stepper.points[list(nodes)] - position)
+        if closing:
+            self._hold()
+
+    def _open_arrived(self) -> None:
+        """Open the hands that have arrived, unless the next goal shows them holding."""
+        for grip in list(self._grips.values()):
+            if grip.hand.end <= self._time + ROUNDING:
+                following = [goal for goal in self._trial.goals if goal.time > grip.hand.end]
+                if following and not self._trial.holds(grip.hand, following[0]):
+                    self._release(grip)
+
+    def _open(self, goal: Goal) -> None:
+        """Open the hands that a goal no longer shows holding."""
+        for grip in list(self._grips.values()):
+            if grip.hand.end < goal.time and not self._trial.holds(grip.hand, goal):
+                self._release(grip)
+
+    def _release(self, grip: _Grip) -> None:
+        del self._grips[grip.hand.name]
+        self._hold()
+
+    def _hold(self) -> None:
+        self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
+
+    def _advance(self, count: int) -> None:
+        step = self._stepper.time_step
+        times = self._time + step * np.arange(1, count + 1)
+        targets = np.zeros((count, 0, 3))
+        for grip in self._grips.values():
+            positions, turns = grip.hand.poses(times)
+            path = positions[:, None, :] + np.einsum('kij,nj->kni', turns, grip.offsets)
+            targets = np.concatenate([targets, path], axis=1)
+        self._stepper.advance(targets)
+        self._time = float(times[-1])
+        self._steps += count
+
+    def _settle(self, limit: float) -> bool:
+        """Go on until all points moved less than a distance within a time."""
+        step = self._stepper.time_step
+        window = max(CHECKS, round(self._settling.time / step))
+        left = round(limit / step)
+        while left >= window:
+            start = self._stepper.points
+            moved = 0.0
+            for part in np.diff(np.linspace(0, window, CHECKS + 1).astype(int)):
+                self._advance(int(part))
+                moved = max(moved, float(np.linalg.norm(self._stepper.points - start, axis=1).max()))
+            if moved < self._settling.distance:
+                return True
+            left -= window
+        if left:
+            self._advance(left)
+        return False

@@ -1,0 +1,123 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Score: the paper's difference score, residual vectors and point errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.trial import Goal, Trial
+
+SIMILAR = 100.0  # below: similar, by the paper's judges
+VERY_SIMILAR = 50.0
+CENTIMETRES = 100.0
+
+
+def focal_point(trial: Trial, goal: Goal) -> int:
+    """
+    Return the index of the paper's p_ref.
+
+    The goal's point nearest to a hand that holds it, else the first point.
+    """
+    best, index = np.inf, 0
+    for hand in trial.hands:
+        if trial.holds(hand, goal):
+            position = hand.poses(goal.time)[0][0]
+            distances = np.linalg.norm(goal.chain.points - position, axis=1)
+            if distances.min() < best:
+                best, index = float(distances.min()), int(distances.argmin())
+    return index
+
+
+def feature_points(trial: Trial, goal: Goal) -> NDArray[np.intp]:
+    """
+    Return the indices of the geometric features of a goal.
+
+    Local maxima and minima in z of the goal, points that a hand gripped, and
+    points that an annotator marked.
+    """
+    z = goal.chain.points[:, 2]
+    rise = np.sign(np.diff(z))
+    features = goal.chain.features | trial.initial.features
+    features[1:-1] |= rise[:-1] * rise[1:] < 0
+    for hand in trial.hands:
+        if hand.start <= goal.time:
+            features[list(hand.grips)] = True
+    return np.flatnonzero(features)
+
+
+def difference_score(goal: Floats, current: Floats, reference: int,
+                     features: NDArray[np.intp] | Sequence[int]) -> float:
+    """
+    Return the paper's difference score, equation (1), in centimetres.
+
+    ``D = || sum_i (|p_ref - p_i|_goal - |p_ref - p_i|_curr) + sum_f |p_f_goal - p_f_curr| ||``
+    with |.| of a vector taken component by component, i over all points and f
+    over the features.  The differences of the first sum keep their sign, as in
+    the paper: those of opposite sign cancel.  So a score of 0 does not prove
+    that two chains are equal; the point errors beside it do.
+
+    :param goal: (n, 3) [m] observed points.
+    :param current: (n, 3) [m] simulated points.
+    :param reference: index of the focal point p_ref.
+    :param features: indices of the geometric features.
+    """
+    shape_goal = np.abs(goal[reference] - goal)
+    shape_current = np.abs(current[reference] - current)
+    shape = (shape_goal - shape_current).sum(axis=0)
+    place = np.abs(goal[features] - current[features]).sum(axis=0)
+    return float(np.linalg.norm(shape + place)) * CENTIMETRES
+
+
+def trial_score(trial: Trial, chains: Floats) -> float:
+    """Return the difference score of simulated (g, n, 3) chains, averaged over the g goals."""
+    return float(np.mean([
+        difference_score(goal.chain.points, chain, focal_point(trial, goal), feature_points(trial, goal))
+        for goal, chain in zip(trial.goals, chains, strict=True)]))
+
+
+def residuals(trial: Trial, chains: Floats) -> Floats:
+    """Return simulated minus observed coordinates, (g * n * 3,) [m], goal by goal."""
+    return np.concatenate([(chain - goal.chain.points).ravel()
+                           for goal, chain in zip(trial.goals, chains, strict=True)])
+
+
+@dataclass(frozen=True)
+class PointErrors:
+    """
+    Errors over all goal points; points that a hand holds count too.
+
+    :param mean: mean Euclidean distance [m].
+    :param rms: root of the mean squared distance [m].
+    :param max: largest distance [m].
+    :param mean_abs: mean absolute difference over points and coordinates [m].
+    """
+
+    mean: float
+    rms: float
+    max: float
+    mean_abs: float
+
+    @classmethod
+    def of(cls, residual: Floats) -> PointErrors:
+        """Return the errors of a residual vector, (3 p,) [m] of p points."""
+        distances = np.linalg.norm(residual.reshape(-1, 3), axis=1)
+        return cls(mean=float(distances.mean()), rms=float(np.sqrt(np.mean(distances**2))),
+                   max=float(distances.max()), mean_abs=float(np.abs(residual).mean()))

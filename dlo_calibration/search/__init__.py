@@ -1,0 +1,29 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Search methods behind ask / tell; SEARCHES is the table of them."""
+
+from __future__ import annotations
+
+from typing import Callable, Mapping
+
+from dlo_calibration.search.protocol import Observation, Search
+from dlo_calibration.search.random import RandomSearch
+
+__all__ = ['SEARCHES', 'Observation', 'RandomSearch', 'Search']
+
+#: name -> constructor(dimension, seed)
+SEARCHES: Mapping[str, Callable[[int, int], Search]] = {
+    RandomSearch.name: RandomSearch,
+}

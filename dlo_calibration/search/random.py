@@ -1,0 +1,51 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The paper's search: uniform random parameter sets."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.search.protocol import Observation
+
+
+class RandomSearch:
+    """
+    Uniform over the unit cube, independent of what was found.
+
+    :param dimension: number of parameters.
+    :param seed: of the `numpy.random.Generator`.
+    """
+
+    name = 'random'
+
+    def __init__(self, dimension: int, seed: int) -> None:
+        self._dimension = dimension
+        self._generator = np.random.default_rng(seed)
+
+    def ask(self, limit: int) -> Floats:
+        """Return `limit` points (m, d): nothing that is told would change them."""
+        return self._generator.random((limit, self._dimension))
+
+    def tell(self, observations: Sequence[Observation]) -> None:
+        """Ignore the results."""
+
+    @property
+    def stop_reason(self) -> str:
+        """Never finishes by itself."""
+        return ''

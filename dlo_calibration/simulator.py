@@ -1,0 +1,66 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulator: what an engine does, and what a simulated trial is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Mapping, Protocol
+
+from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.trial import Trial
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """
+    One simulated trial.
+
+    :param chains: (g, n, 3) [m] the simulated points at each of the g goals.
+    :param settled: (g,) False where a goal is a stable configuration and the
+        DLO had not come to rest within the time limit; it is compared as it was.
+    :param duration: simulated time [s].
+    :param steps: time steps taken.
+    """
+
+    chains: Floats
+    settled: tuple[bool, ...]
+    duration: float
+    steps: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'chains', frozen_array(self.chains))
+
+
+class Simulator(Protocol):
+    """
+    Simulates trials; the same call gives the same rollout, bit for bit.
+
+    It is pickled to worker processes before it is used, so what cannot be
+    pickled is made at the first `simulate` and dropped when pickled.
+    """
+
+    name: str
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """
+        Simulate a trial with physical parameters by name (SI units).
+
+        :raises SimulationError: where the rollout diverges or the trial cannot
+            be represented.
+        """
+
+    def close(self) -> None:
+        """Free what the simulator holds; it may be used again afterwards."""

@@ -1,0 +1,101 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Trial: one observed manipulation of a DLO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.chain import Chain, Floats, frozen_array
+from dlo_calibration.errors import InputError
+
+
+@dataclass(frozen=True)
+class Goal:
+    """
+    The DLO as it was observed during or after an action.
+
+    :param chain: point i is the same material point as point i of the initial chain.
+    :param time: seconds since the start of the trial.
+    :param stable: True where the simulated DLO is compared when it came to rest
+        after `time`; False where it is compared at that instant.
+    :param held_by: names of the hands that still hold the DLO in this goal.
+    """
+
+    chain: Chain
+    time: float
+    stable: bool = True
+    held_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    One observed manipulation: where the DLO was, what hands did, where it went.
+
+    :param initial: the DLO before the action; its points' places along the
+        curve are the material coordinates of all chains of the trial.
+    :param actions: one or more, in the order of their start.
+    :param goals: one or more, in the order of their time.
+    :param velocity: (n, 3) [m/s] of the initial points; None: at rest.
+    """
+
+    name: str
+    initial: Chain
+    actions: tuple[Action, ...]
+    goals: tuple[Goal, ...]
+    velocity: Floats | None = None
+
+    def __post_init__(self) -> None:
+        thing = f'trial {self.name!r}'
+        actions = tuple(sorted(self.actions, key=lambda action: action.start))
+        goals = tuple(sorted(self.goals, key=lambda goal: goal.time))
+        n = len(self.initial)
+        if not actions:
+            raise InputError(thing, 'no action', 'at least one', 'say what the hands did')
+        if not goals:
+            raise InputError(thing, 'no goal chain', 'at least one', 'observe the DLO after the action')
+        for goal in goals:
+            if len(goal.chain) != n:
+                raise InputError(
+                    thing, f'a goal of {len(goal.chain)} points', f'{n} points as in the initial chain',
+                    'resample both chains to the same material points')
+        for action in actions:
+            for hand in action.hands:
+                if not all(0 <= grip < n for grip in hand.grips):
+                    raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
+                                     f'points 0 to {n - 1}', 'correct the gripped points')
+        object.__setattr__(self, 'actions', actions)
+        object.__setattr__(self, 'goals', goals)
+        if self.velocity is not None:
+            velocity = frozen_array(self.velocity)
+            if velocity.shape != (n, 3) or not np.isfinite(velocity).all():
+                raise InputError(thing, f'a velocity of shape {velocity.shape}',
+                                 f'({n}, 3) finite numbers in m/s', 'give one vector per point')
+            object.__setattr__(self, 'velocity', velocity)
+
+    @property
+    def hands(self) -> tuple[Hand, ...]:
+        """All hands of all actions, in the order of their start."""
+        return tuple(hand for action in self.actions for hand in action.hands)
+
+    def holds(self, hand: Hand, goal: Goal) -> bool:
+        """Tell whether `hand` holds the DLO when `goal` is observed."""
+        if goal.time <= hand.end:
+            return goal.time >= hand.start
+        return hand.name in goal.held_by
