@@ -30,13 +30,14 @@ import pybullet
 from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.contact import SelfContact
 from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
-from dlo_calibration.parameters import ASSUMED_DENSITY, GRAVITY
+from dlo_calibration.parameters import GRAVITY
 from dlo_calibration.rod import Rod, RodProperties
-from dlo_calibration.rollout import Settling, roll_out
+from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.simulator import Rollout
 from dlo_calibration.trial import Trial
 
 DEFAULT_NODES = 31
+DEFAULT_TIME_STEP = 0.004  # s
 ROPE_GROUP = 1 << 6  # collision group whose members do not collide with each other in Bullet
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 INERTIA = 1e6  # kg m^2: spheres slide, they do not roll
@@ -156,14 +157,15 @@ class BulletRope:
         self._wanted = wanted
         sent = wanted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client
-        for body, velocity in zip(self.bodies, sent.tolist()):
+        for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
             pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
 
     def after_step(self) -> None:
         """Take the positions and velocities that contacts left."""
         client = self._client
-        for node, target in zip(self._held, self._targets.tolist()):
-            pybullet.resetBasePositionAndOrientation(self.bodies[node], target, NO_TURN, physicsClientId=client)
+        for node, target in zip(self._held, self._targets.tolist(), strict=True):
+            pybullet.resetBasePositionAndOrientation(self.bodies[node], target, NO_TURN,
+                                                     physicsClientId=client)
         points = np.array([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
                            for body in self.bodies])
         self._velocities = (points - self._points) / self.time_step
@@ -201,7 +203,7 @@ class BulletSimulator:
     name = 'bullet'
 
     def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
-                 time_step: float = 0.005, stable_distance: float = Settling.distance,
+                 time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
                  stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
         self._table_height = table_height if table else None
         self._nodes = nodes
@@ -254,7 +256,8 @@ class _World:
             physicsClientId=self._client)
         pybullet.setGravity(0, 0, -GRAVITY, physicsClientId=self._client)
         shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=self._client)
-        self._plane = pybullet.createMultiBody(0, shape, useMaximalCoordinates=True, physicsClientId=self._client)
+        self._plane = pybullet.createMultiBody(0, shape, useMaximalCoordinates=True,
+                                               physicsClientId=self._client)
         pybullet.changeDynamics(self._plane, -1, lateralFriction=1.0, restitution=0.0,
                                 physicsClientId=self._client)
         self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=self.SPHERE)

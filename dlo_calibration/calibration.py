@@ -16,16 +16,16 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass, replace
+import time
 from typing import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.parameters import SCALE, ParameterSpace
+from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors, residuals, trial_score
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Rollout, Simulator
@@ -271,7 +271,8 @@ def _warnings(best: Evaluation, kept: Sequence[Evaluation]) -> tuple[str, ...]:
         warnings.append(f'never came to rest: {", ".join(best.unsettled)}; compared as it was at the limit')
     failed = [evaluation for evaluation in kept if evaluation.failure]
     if failed:
-        warnings.append(f'{len(failed)} of {len(kept)} evaluations could not be simulated: {failed[0].failure}')
+        warnings.append(f'{len(failed)} of {len(kept)} evaluations could not be simulated: '
+                        f'{failed[0].failure}')
     return tuple(warnings)
 
 

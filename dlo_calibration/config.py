@@ -26,7 +26,7 @@ from typing import Any, Iterator, Mapping
 
 from dlo_calibration.calibration import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import BY_NAME, PAPER_PARAMETERS, PARAMETERS, SCALE, ParameterSpace
+from dlo_calibration.parameters import BY_NAME, PAPER_PARAMETERS, PARAMETERS, ParameterSpace, SCALE
 from dlo_calibration.search import SEARCHES
 
 ENGINES = ('bullet',)
@@ -69,7 +69,8 @@ class Declaration:
         if self.choices:
             for one in value if kind is tuple else (value,):
                 if one not in self.choices:
-                    raise InputError(what, f'{one!r}', f'one of {", ".join(self.choices)}', 'choose one of them')
+                    raise InputError(what, f'{one!r}', f'one of {", ".join(self.choices)}',
+                                     'choose one of them')
         low, high = self.minimum, self.maximum
         if kind in (int, float) and not (
                 (low is None or value >= low) and (high is None or value <= high)):
@@ -101,13 +102,13 @@ class Options:
         PAPER_PARAMETERS, 'names of the parameters to find; the others keep their value',
         choices=tuple(BY_NAME))
     search: str = _option('random', 'search method', choices=tuple(SEARCHES))
-    evaluations: int = _option(PAPER_EVALUATIONS, 'parameter sets to try at most (the paper\'s rounds)',
+    evaluations: int = _option(PAPER_EVALUATIONS, "parameter sets to try at most (the paper's rounds)",
                                minimum=1, maximum=1000000)
     seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
     engine: str = _option('bullet', 'simulation engine', choices=ENGINES)
     workers: int = _option(0, 'number of processes that simulate; 0: one per core', minimum=0, maximum=1024)
     nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
-    time_step: float = _option(0.005, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
+    time_step: float = _option(0.004, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
     stable_distance: float = _option(
         0.001, 'a DLO is stable when all its points moved less than this within stable_time',
         unit='m', minimum=1e-6, maximum=0.1)

@@ -25,12 +25,15 @@ Splitting for Jitter-Free Parallel Rigid Body Simulation, 2012).
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.chain import Floats
 
+Indices = NDArray[np.intp]
+
 ITERATIONS = 10
-PUSH_OUT = 0.5  # share of a penetration that one step removes
-FASTEST_PUSH_OUT = 0.5  # m/s, so that nothing is kicked
+PUSH_OUT = 0.8  # share of a penetration that one step removes
+FASTEST_PUSH_OUT = 0.8  # m/s, so that nothing is kicked
 SUPPORTED = 0.5  # cosine between a push and the support against it
 WEDGED = 0.1  # a pair of which less than that share can yield is wedged: then all of it does
 TINY = 1e-12
@@ -103,10 +106,11 @@ class SelfContact:
         middles = (points[1:] + points[:-1]) / 2
         squares = np.einsum('ij,ij->i', middles, middles)
         distances = squares[:, None] + squares[None, :] - 2 * middles @ middles.T
-        return np.sqrt(np.maximum(distances, 0)) - stretch * self._reach
+        gaps: Floats = np.sqrt(np.maximum(distances, 0)) - stretch * self._reach
+        return gaps
 
     def _resolve(self, points: Floats, velocities: Floats, inverse_masses: Floats, support: Floats,
-                 first: np.ndarray, second: np.ndarray) -> Floats:
+                 first: Indices, second: Indices) -> Floats:
         s, t, normal, distance = _closest(points, first, second)
         allowed = np.maximum(self._distance[first, second], np.minimum(distance, self._diameter))
         self._distance[first, second] = allowed
@@ -146,8 +150,8 @@ class SelfContact:
         return resolved
 
 
-def _closest(points: Floats, first: np.ndarray,
-             second: np.ndarray) -> tuple[Floats, Floats, Floats, Floats]:
+def _closest(points: Floats, first: Indices,
+             second: Indices) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Closest points of pairs of segments, (c,) indices of their first nodes.
 

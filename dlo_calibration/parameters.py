@@ -22,8 +22,8 @@ an engine reads its physical value by name.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
+import math
 from typing import Mapping, Sequence
 
 import numpy as np

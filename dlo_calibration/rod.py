@@ -18,11 +18,18 @@ Rod: the internal forces of the mass-spring chain, integrated implicitly.
 Point masses in a line.  Stretching springs of stiffness ``EA / l`` join
 neighbours, bending has the energy ``EI / (2 l) |t_i - t_(i-1)|^2`` at each inner
 node, with t the segment vectors divided by their rest length (the discrete
-curvature of Bergou et al., Discrete Elastic Rods, 2008, without twist).  A step
-is the linearised backward Euler of Baraff and Witkin, Large Steps in Cloth
-Simulation, 1998, equation 6, with the part of the stretching Hessian that a
-compressed spring makes negative left out, so that the matrix stays positive
-definite and any stiffness is stable at any time step.
+curvature of Bergou et al., Discrete Elastic Rods, 2008, without twist).  A step is
+
+    [M (1 + drag dt) + c K] v' = M v + dt f(x),    x' = x + dt v'
+
+With c = dt^2 that is the linearised backward Euler of Baraff and Witkin, Large
+Steps in Cloth Simulation, 1998, equation 6.  For one mode of a linear spring any
+c >= dt^2 / 2 is stable at any stiffness, and its determinant shows that c damps
+it like a stiffness-proportional damping of c / dt.  So c is dt times the internal
+damping wherever that is large enough to be stable, and 0.6 dt^2 where it is
+not (at 0.5 the stiffest modes would ring for ever): the damping is then less the
+time step's.  The part of the stretching matrix that a compressed spring makes
+negative is left out, so that the matrix stays positive definite.
 """
 
 from __future__ import annotations
@@ -31,12 +38,16 @@ from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from dlo_calibration.chain import Floats
 from dlo_calibration.errors import SimulationError
 
+Indices = NDArray[np.intp]
+
 BANDS = 7  # diagonal and six below it: node i couples to i + 2, three coordinates each
+IMPLICIT = 0.6  # see the module
 HELD = 1e12  # a held node's share of the matrix, relative to its mass
 
 
@@ -82,7 +93,7 @@ class Rod:
         self.masses = properties.mass * weights / weights.sum()
         self._properties = properties
         self._rest_points = np.zeros((n, 3)) if rest_points is None else rest_points
-        self._implicit = time_step**2 + properties.internal_damping * time_step
+        self._implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
         self._places, self._signs = _stretching_places(n)
         self.hold(())
 
@@ -105,7 +116,7 @@ class Rod:
             self._constant[3 * offset] += self._implicit * self._bending[offset][:, None]
 
     @property
-    def held(self) -> np.ndarray:
+    def held(self) -> Indices:
         """Indices of the held nodes."""
         return self._held
 
@@ -139,10 +150,9 @@ class Rod:
         diagonal = np.zeros((len(points), 3, 3))
         diagonal[:-1] = blocks
         diagonal[1:] += blocks
-        bands = self._constant.ravel().copy()
-        bands[self._places] += self._signs * np.concatenate(
+        bands = self._constant.copy()
+        bands.reshape(-1)[self._places] += self._signs * np.concatenate(
             [diagonal[:, _ROWS, _COLUMNS].ravel(), blocks.ravel()])
-        bands = bands.reshape(BANDS, -1, 3)
         bands[0, self._held] += self._pull[:, None]
         right[self._held] += self._pull[:, None] * held_velocities
         _, solution, info = lapack.dpbsv(bands.reshape(BANDS, -1), right.ravel(), lower=1,
@@ -154,7 +164,7 @@ class Rod:
     def _bend(self, points: Floats) -> Floats:
         """Multiply (N, 3) with the bending matrix."""
         diagonal, first, second = self._bending
-        product = diagonal[:, None] * points
+        product: Floats = diagonal[:, None] * points
         product[:-1] += first[:-1, None] * points[1:]
         product[1:] += first[:-1, None] * points[:-1]
         product[:-2] += second[:-2, None] * points[2:]
@@ -165,7 +175,7 @@ class Rod:
 _ROWS, _COLUMNS = (np.array(indices) for indices in ((0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 1, 0)))
 
 
-def _bending_bands(rest_lengths: Floats, rigid: np.ndarray, stiffness: float) -> Floats:
+def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: float) -> Floats:
     """Bending matrix (N, N), symmetric: its diagonal and the two below it, (3, N)."""
     n = len(rest_lengths) + 1
     before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]
@@ -180,10 +190,11 @@ def _bending_bands(rest_lengths: Floats, rigid: np.ndarray, stiffness: float) ->
     return bands
 
 
-def _stretching_places(n: int) -> tuple[np.ndarray, Floats]:
+def _stretching_places(n: int) -> tuple[Indices, Floats]:
     """Where stretching blocks go in the flat (BANDS, N, 3) lower bands, and with which sign."""
-    def place(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return (row - column) * 3 * n + column
+    def place(row: Indices, column: Indices) -> Indices:
+        at: Indices = (row - column) * 3 * n + column
+        return at
 
     nodes = 3 * np.arange(n)[:, None]
     same = place(nodes + _ROWS, nodes + _COLUMNS).ravel()

@@ -22,8 +22,8 @@ Times in which nothing happens any more are skipped.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+import math
 from typing import Protocol
 
 import numpy as np
@@ -86,7 +86,8 @@ def roll_out(trial: Trial, layout: Layout, stepper: Stepper, settling: Settling)
 class _Grip:
     hand: Hand
     nodes: tuple[int, ...]
-    offsets: Floats  # of the nodes from the hand as it closed
+    closed: int  # step at which it closed
+    path: Floats  # (k, n, 3) [m] of the nodes after each step since, until the hand rests
 
 
 class _Course:
@@ -117,7 +118,8 @@ class _Course:
         return Rollout(np.array(chains), tuple(settled), self._steps * self._stepper.time_step, self._steps)
 
     def _observed(self, points: Floats) -> Floats:
-        return self._layout.observe @ points
+        observed: Floats = self._layout.observe @ points
+        return observed
 
     def _points_at(self, instant: float) -> Floats:
         """Go on to an instant; between two steps, interpolate."""
@@ -130,7 +132,7 @@ class _Course:
             self._advance(1)
             self._open_arrived()
         share = (instant - start) / (self._time - start) if self._time > start else 0.0
-        return before + np.clip(share, 0, 1) * (self._stepper.points - before)
+        return before + min(max(share, 0.0), 1.0) * (self._stepper.points - before)
 
     def _act_until(self, until: float) -> None:
         """Let hands act until then; where none moves, go on at most until the DLO is at rest."""
@@ -156,8 +158,12 @@ class _Course:
         for hand in closing:
             self._waiting.remove(hand)
             nodes = self._layout.nodes(hand)
-            position = hand.poses(self._time)[0][0]
-            self._grips[hand.name] = _Grip(hand, nodes, self._stepper.points[list(nodes)] - position)
+            step = self._stepper.time_step
+            count = max(1, math.ceil((hand.end - self._time) / step - ROUNDING))
+            positions, turns = hand.poses(self._time + step * np.arange(count + 1))
+            offsets = self._stepper.points[list(nodes)] - positions[0]
+            path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:] @ turns[0].T, offsets)
+            self._grips[hand.name] = _Grip(hand, nodes, self._steps, path)
         if closing:
             self._hold()
 
@@ -183,15 +189,10 @@ class _Course:
         self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
 
     def _advance(self, count: int) -> None:
-        step = self._stepper.time_step
-        times = self._time + step * np.arange(1, count + 1)
-        targets = np.zeros((count, 0, 3))
-        for grip in self._grips.values():
-            positions, turns = grip.hand.poses(times)
-            path = positions[:, None, :] + np.einsum('kij,nj->kni', turns, grip.offsets)
-            targets = np.concatenate([targets, path], axis=1)
-        self._stepper.advance(targets)
-        self._time = float(times[-1])
+        targets = [grip.path[np.minimum(np.arange(count) + self._steps - grip.closed, len(grip.path) - 1)]
+                   for grip in self._grips.values()]
+        self._stepper.advance(np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3)))
+        self._time += count * self._stepper.time_step
         self._steps += count
 
     def _settle(self, limit: float) -> bool:

@@ -37,12 +37,11 @@ def focal_point(trial: Trial, goal: Goal) -> int:
     The goal's point nearest to a hand that holds it, else the first point.
     """
     best, index = np.inf, 0
-    for hand in trial.hands:
-        if trial.holds(hand, goal):
-            position = hand.poses(goal.time)[0][0]
-            distances = np.linalg.norm(goal.chain.points - position, axis=1)
-            if distances.min() < best:
-                best, index = float(distances.min()), int(distances.argmin())
+    for hand in trial.holding(goal):
+        position = hand.poses(goal.time)[0][0]
+        distances = np.linalg.norm(goal.chain.points - position, axis=1)
+        if distances.min() < best:
+            best, index = float(distances.min()), int(distances.argmin())
     return index
 
 

@@ -94,8 +94,14 @@ class Trial:
         """All hands of all actions, in the order of their start."""
         return tuple(hand for action in self.actions for hand in action.hands)
 
+    def holding(self, goal: Goal) -> tuple[Hand, ...]:
+        """Return the hands that hold the DLO when `goal` is observed, the last of each name."""
+        last = {hand.name: hand for hand in sorted(self.hands, key=lambda hand: hand.start)
+                if hand.start <= goal.time}
+        return tuple(hand for hand in last.values() if self.holds(hand, goal))
+
     def holds(self, hand: Hand, goal: Goal) -> bool:
-        """Tell whether `hand` holds the DLO when `goal` is observed."""
+        """Tell whether `hand` holds the DLO when `goal` is observed, or one of its name that took over."""
         if goal.time <= hand.end:
             return goal.time >= hand.start
         return hand.name in goal.held_by
