@@ -1,0 +1,77 @@
+# Every target sets up what it needs, in .venv.  With ROS 2 Jazzy sourced, the machine's client library is
+# used; else the same library comes from PyPI, for Python 3.11 or 3.12.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench clean
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+LINT := test/test_lint.py test/test_copyright.py test/test_architecture.py test/test_packaging.py
+
+ifeq ($(shell test "$${ROS_DISTRO-}" = jazzy && python3 -c 'import rclpy' 2>/dev/null && echo yes),yes)
+# numpy 2 cannot load message types that were built against numpy 1.
+ROS := machine
+CANDIDATES := python3
+VENV_OPTIONS := --system-site-packages
+REQUIREMENTS := '.[test]' 'numpy<2'
+else
+# Libraries of another ROS or of another environment must not mix with those of .venv.
+ROS := pypi
+CANDIDATES := python3.11 python3 python3.12
+VENV_OPTIONS :=
+REQUIREMENTS := '.[ros,test]'
+unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+export AMENT_PREFIX_PATH := $(abspath $(VENV))
+export RMW_IMPLEMENTATION := rmw_fastrtps_cpp
+endif
+STAMP := $(VENV)/installed-with-ros-from-$(ROS)
+
+help:
+	@cat <<-END
+	  make demo    calibrate a sample session with the real node, and draw the result
+	  make test    run all tests
+	  make lint    run the checks of style, types, imports and packaging alone
+	  make bench   measure the speed of simulation and search
+	  make clean   remove .venv and everything that was built
+	END
+
+demo: $(STAMP)
+	@$(PYTHON) -m dlo_calibration.demo
+
+test: $(STAMP)
+	@$(PYTHON) -m pytest
+
+lint: $(STAMP)
+	@$(PYTHON) -m pytest $(LINT)
+
+bench: $(STAMP)
+	@$(PYTHON) -m pytest benchmark
+
+clean:
+	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(STAMP): setup.py
+	@fail() { printf '%s\n' "$$@" >&2; exit 1; }
+	base=
+	for candidate in $(CANDIDATES); do
+	  if $$candidate -c 'import sys; sys.exit(sys.version_info[:2] not in [(3, 11), (3, 12)])' 2>/dev/null; then
+	    base=$$candidate; break
+	  fi
+	done
+	[ -n "$$base" ] || fail 'Found none of: $(CANDIDATES), of version 3.11 or 3.12.' \
+	  'Install Python 3.11 or 3.12, with its venv module, and try again.'
+	$$base -c 'import venv, ensurepip' 2>/dev/null || fail "$$base has no venv module." \
+	  'Install it (Debian, Ubuntu: sudo apt install python3-venv) and try again.'
+	if [ ! -e $(STAMP) ]; then $$base -m venv --clear $(VENV_OPTIONS) $(VENV); fi
+	echo "Installing into $(VENV) with $$($(PYTHON) --version); ROS comes from $(ROS). This takes a minute or two."
+	if $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' &&
+	    ! $(PYTHON) -c 'import pybullet' 2>/dev/null; then
+	  command -v c++ >/dev/null || fail 'PyBullet must be compiled for this Python, and there is no C++ compiler.' \
+	    'Install one (Debian, Ubuntu: sudo apt install build-essential python3-dev), or Python 3.11.'
+	  echo 'PyBullet has no binary for this Python: it is compiled now, which takes about four minutes more.'
+	fi
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable $(REQUIREMENTS)
+	touch $@

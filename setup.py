@@ -1,0 +1,89 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Package the calibrator for colcon (ament_python) and for pip."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'dlo_calibration'
+SHARED_FOLDERS = ('config', 'launch', 'msg_samples')
+
+
+def shared_files():
+    """List (destination, files) of everything that goes to the package's share folder."""
+    listed = [
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+    ]
+    for top in SHARED_FOLDERS:
+        for folder in sorted([Path(top), *Path(top).rglob('*/')]):
+            files = sorted(str(file) for file in folder.glob('[!.]*') if file.is_file())
+            if files and folder.name != '__pycache__':
+                listed.append((f'share/{NAME}/{folder.as_posix()}', files))
+    return listed
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Find the physical parameters of ropes, cables, wires and hoses from observed manipulations',
+    author='The dlo_calibration authors',
+    maintainer='The dlo_calibration authors',
+    maintainer_email='dlo_calibration@example.org',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed', '*.xsd', '*.rng']},
+    data_files=shared_files(),
+    zip_safe=False,
+    python_requires='>=3.11',
+    # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.
+    install_requires=[
+        'lxml>=5.2',
+        'matplotlib>=3.6',
+        'mcap>=1.6',
+        'numpy>=1.26',
+        'pybullet>=3.2.5',
+        'rich>=13.7',
+        'rosbags>=0.11',
+        'ruamel.yaml>=0.17',
+        'scipy>=1.11',
+    ],
+    extras_require={
+        # On a machine with ROS 2 Jazzy these come from its own packages.
+        'ros': [
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-rclpy',
+            'ros-jazzy-rmw-fastrtps-cpp',
+        ],
+        'test': [
+            'colcon-core',
+            'colcon-ros',
+            'hypothesis>=6.98',
+            'mypy>=1.14',
+            'pytest>=7.4',
+            'pytest-benchmark>=4.0',
+            'ruff>=0.6',
+            'setuptools>=70.1,<80',  # builds wheels by itself; colcon knows none newer
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            f'calibrator = {NAME}.calibrator:main',
+            f'dlo-calibration = {NAME}.cli:main',
+        ],
+    },
+)

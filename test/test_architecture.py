@@ -1,0 +1,106 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Imports run one way, and heavy libraries stay where they belong."""
+
+import ast
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+PACKAGE = 'dlo_calibration'
+FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
+
+#: A module imports only from those before it; the modules of a subpackage share its place.
+ORDER = (
+    # pure NumPy and SciPy
+    'errors', 'chain', 'action', 'trial', 'parameters', 'simulator', 'score', 'search', 'uncertainty',
+    'calibration', '__init__', 'config',
+    # messages and files
+    'messages', 'collector', 'recording', 'xml', 'session',
+    # engines
+    'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',
+    # edges
+    'pool', 'worker', 'picture', 'terminal', 'report', 'signals', 'recorder', 'node', 'calibrator', 'cli',
+    '__main__', 'demo',
+)
+
+#: The only modules that may import something, be it at the top or inside a function.
+ONLY = {
+    'rclpy': {'node', 'demo'},  # the demo stands for the robot, on the other side of the graph
+    'pybullet': {'bullet'},
+    'lxml': {'xml'},
+    'dlo_calibration.bullet': {'engines'},
+    'dlo_calibration.engines': {'node', 'cli'},
+    'dlo_calibration.trial': set(ORDER) - {'search'},
+}
+
+NOT_LOADED = ('rclpy', 'pybullet', 'matplotlib', 'scipy.optimize')
+
+FILES = sorted(FOLDER.rglob('*.py'))
+
+
+def place(file: Path) -> str:
+    """Name the entry of ORDER that a file belongs to."""
+    first, *rest = file.relative_to(FOLDER).parts
+    return first if rest else file.stem
+
+
+def imported(file: Path) -> set[str]:
+    """List the full names that a file imports, anywhere in it."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{file.name}: line {node.lineno} imports relatively'
+            names.add(node.module)
+            names.update(f'{node.module}.{alias.name}' for alias in node.names)
+    return names
+
+
+def own_places(names: set[str]) -> set[str]:
+    """List the entries of ORDER among imported names; the bare package is its `__init__`."""
+    parts = [name.split('.') for name in names if name.split('.')[0] == PACKAGE]
+    found = {part[1] for part in parts if len(part) > 1 and part[1] in ORDER}
+    named_in_init = any(len(part) > 1 and part[1] not in ORDER for part in parts)
+    return found | ({'__init__'} if named_in_init else set())
+
+
+def test_every_module_has_its_place_in_the_order():
+    assert {place(file) for file in FILES} == set(ORDER), 'give each module its place in ORDER'
+
+
+@pytest.mark.parametrize('file', FILES, ids=lambda file: str(file.relative_to(FOLDER)))
+def test_module_imports_only_what_stands_before_it(file):
+    here = place(file)
+    assert here in ORDER, f'give {here} its place in ORDER'
+    allowed = {here, *ORDER[:ORDER.index(here)]}
+    assert own_places(imported(file)) - allowed == set()
+
+
+@pytest.mark.parametrize('name', ONLY)
+def test_only_its_owner_imports(name):
+    importers = {place(file) for file in FILES
+                 if any(one == name or one.startswith(f'{name}.') for one in imported(file))}
+    assert importers - ONLY[name] == set()
+
+
+def test_importing_the_package_loads_no_heavy_library():
+    program = f'import sys, {PACKAGE}; print(*(name for name in {NOT_LOADED} if name in sys.modules))'
+    done = subprocess.run([sys.executable, '-c', program], cwd=FOLDER.parent, check=True,
+                          capture_output=True, text=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,44 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The style and type checks of the project, as tests."""
+
+from importlib.util import find_spec
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def findings(*arguments):
+    """Return what a tool says about the repository, or nothing where it is content."""
+    if find_spec(arguments[0]) is None:
+        pytest.skip(f'{arguments[0]} is not installed; the extra "test" of setup.py has it')
+    done = subprocess.run([sys.executable, '-m', *arguments], cwd=ROOT, capture_output=True, text=True)
+    return f'{done.stdout}{done.stderr}' if done.returncode else ''
+
+
+def test_ruff_finds_nothing():
+    found = findings('ruff', 'check', '--output-format', 'concise')
+    assert not found, found
+
+
+@pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < '2.0.0', reason='types of numpy 1 are less exact')
+def test_mypy_finds_nothing():
+    found = findings('mypy')
+    assert not found, found

@@ -1,0 +1,158 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The package installs with colcon and with pip, and says what it needs."""
+
+import ast
+from importlib.metadata import packages_distributions
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+
+from lxml import etree
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'dlo_calibration'
+EXECUTABLES = ('calibrator', 'dlo-calibration')
+SOURCES = (NAME, 'config', 'launch', 'msg_samples', 'resource')
+
+#: Import name of a Python library -> its rosdep key, where that is not python3-<name>.
+ROSDEP_KEYS = {
+    'mcap': 'mcap-ros2-support',
+    'pybullet': 'python3-pybullet-pip',
+    'rosbags': 'python3-rosbags-pip',
+    'ruamel': 'python3-ruamel.yaml',
+}
+
+
+@pytest.fixture(scope='module')
+def sources(tmp_path_factory):
+    """Copy the sources, so that a build leaves nothing in the repository."""
+    copy = tmp_path_factory.mktemp('packaging') / 'src'
+    copy.mkdir()
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns('__pycache__'))
+    for file in ROOT.glob('*.*'):
+        if file.is_file():
+            shutil.copy(file, copy)
+    shutil.copy(ROOT / 'LICENSE', copy)
+    return copy
+
+
+@pytest.fixture(scope='module')
+def prefix(sources):
+    """Build with colcon and return the package's install folder."""
+    if find_spec('colcon_core') is None or find_spec('colcon_ros') is None:
+        pytest.skip('colcon is not installed; the extra "test" of setup.py has it')
+    workspace = sources.parent
+    done = subprocess.run(
+        [sys.executable, '-W', 'ignore', '-m', 'colcon', '--log-base', 'log', 'build'],
+        cwd=workspace, capture_output=True, text=True)
+    assert done.returncode == 0, f'{done.stdout}{done.stderr}'
+    return workspace / 'install' / NAME
+
+
+def third_party_imports():
+    """List the top-level names that the package imports from others."""
+    names = set()
+    for file in (ROOT / NAME).rglob('*.py'):
+        for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                names.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                names.add(node.module)
+    tops = {name.split('.')[0] for name in names}
+    return sorted(tops - set(sys.stdlib_module_names) - {NAME})
+
+
+def manifest():
+    return etree.parse(ROOT / 'package.xml').getroot()
+
+
+def setup_value(name):
+    return re.search(rf"\b{name}='([^']+)'", (ROOT / 'setup.py').read_text(encoding='utf-8'))[1]
+
+
+def test_manifest_is_a_format_3_ament_python_package():
+    package = manifest()
+    assert (package.tag, package.get('format')) == ('package', '3')
+    assert package.findtext('name') == NAME
+    assert package.findtext('license') == setup_value('license')
+    assert package.find('maintainer').get('email') == setup_value('maintainer_email')
+    assert package.findtext('export/build_type') == 'ament_python'
+
+
+def test_manifest_and_setup_give_the_same_version():
+    assert manifest().findtext('version') == setup_value('version')
+
+
+@pytest.mark.parametrize('name', third_party_imports())
+def test_what_is_imported_is_declared(name):
+    keys = {element.text for element in manifest().iterfind('exec_depend')}
+    if name in keys:
+        return  # a ROS package, which has the name of its module and is not for setup.py
+    assert ROSDEP_KEYS.get(name, f'python3-{name}') in keys, 'add it to package.xml'
+    requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    distributions = packages_distributions().get(name, [name])
+    assert any(f"'{one}>=" in requirements for one in distributions), 'add it to setup.py'
+
+
+def test_colcon_puts_executables_where_ros2_run_looks(prefix):
+    for name in EXECUTABLES:
+        assert os.access(prefix / 'lib' / NAME / name, os.X_OK)
+
+
+def test_colcon_registers_the_package(prefix):
+    assert (prefix / 'share/ament_index/resource_index/packages' / NAME).is_file()
+    assert (prefix / 'share' / NAME / 'package.xml').is_file()
+
+
+def test_colcon_installs_the_shared_folders(prefix, sources):
+    for folder in ('config', 'launch', 'msg_samples'):
+        wanted = {file.relative_to(sources) for file in (sources / folder).rglob('*')
+                  if file.is_file() and not file.name.startswith('.')}
+        share = prefix / 'share' / NAME
+        assert wanted <= {file.relative_to(share) for file in share.rglob('*')}
+
+
+def test_executable_starts_as_ros2_run_starts_it(prefix):
+    library = prefix / 'lib' / f'python{sys.version_info.major}.{sys.version_info.minor}' / 'site-packages'
+    environment = {**os.environ, 'PYTHONPATH': f'{library}{os.pathsep}{os.environ.get("PYTHONPATH", "")}'}
+    done = subprocess.run([prefix / 'lib' / NAME / 'dlo-calibration', '--help'], cwd=prefix,
+                          env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert 'fit' in done.stdout
+
+
+def test_wheel_has_the_commands_the_types_and_the_shared_files(sources, tmp_path):
+    if find_spec('setuptools') is None or find_spec('setuptools.command.bdist_wheel') is None:
+        pytest.skip('setuptools is missing or cannot build wheels; the extra "test" of setup.py has it')
+    subprocess.run(
+        [sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps', '--no-build-isolation',
+         '--wheel-dir', tmp_path, sources], check=True)
+    wheel = zipfile.ZipFile(next(tmp_path.glob('*.whl')))
+    names = wheel.namelist()
+    entry_points = wheel.read(next(name for name in names if name.endswith('entry_points.txt'))).decode()
+    assert all(f'{name} = ' in entry_points for name in EXECUTABLES)
+    assert f'{NAME}/py.typed' in names
+    assert f'{NAME}/search/__init__.py' in names
+    assert any(name.endswith(f'share/{NAME}/package.xml') for name in names)
+    assert not any(name.startswith('test') for name in names)
