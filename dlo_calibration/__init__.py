@@ -15,10 +15,10 @@
 """Find the physical parameters of a rope, cable, wire or hose from observed manipulations."""
 
 from dlo_calibration.action import Action, Hand
-from dlo_calibration.calibration import CalibrationResult, Evaluation, calibrate
+from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
 from dlo_calibration.chain import Chain
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.parameters import PARAMETERS, Parameter, ParameterSpace
+from dlo_calibration.parameters import Parameter, PARAMETERS, ParameterSpace
 from dlo_calibration.simulator import Rollout, Simulator
 from dlo_calibration.trial import Goal, Trial
 

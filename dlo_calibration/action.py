@@ -73,7 +73,7 @@ class Hand:
                              'sort the waypoints and remove repeated ones')
         norms = np.linalg.norm(orientations, axis=1, keepdims=True)
         if (norms < 0.5).any():
-            raise InputError(thing, 'a quaternion of length 0', 'a unit quaternion x y z w',
+            raise InputError(thing, f'a quaternion of length {norms.min():.2g}', 'a unit quaternion x y z w',
                              'use 0 0 0 1 for a hand that does not turn')
         object.__setattr__(self, 'grips', tuple(int(g) for g in self.grips))
         object.__setattr__(self, 'times', times)
@@ -90,17 +90,21 @@ class Hand:
         """When the hand arrives at its last waypoint [s]."""
         return float(self.times[-1])
 
+    def positions_at(self, at: ArrayLike) -> Floats:
+        """Return where the hand is at `at`, (m,) [s] -> (m, 3) [m]; it rests before its path and after."""
+        times = np.atleast_1d(np.asarray(at, dtype=float))
+        return np.stack([np.interp(times, self.times, axis) for axis in self.positions.T], axis=1)
+
     def poses(self, at: ArrayLike) -> tuple[Floats, Floats]:
         """
-        Where the hand is at `at`, (m,) [s]; it rests before its path and after.
+        Return where the hand is at `at`, (m,) [s], and how it has turned.
 
         :returns: (m, 3) positions [m] and (m, 3, 3) rotation matrices since it closed.
         """
         times = np.clip(np.atleast_1d(np.asarray(at, dtype=float)), self.start, self.end)
-        positions = np.stack([np.interp(times, self.times, axis) for axis in self.positions.T], axis=1)
         turns = Rotation.from_quat(self.orientations)
         turned = Slerp(self.times, turns)(times) if len(self.times) > 1 else turns[np.zeros(len(times), int)]
-        return positions, (turned * turns[0].inv()).as_matrix()
+        return self.positions_at(times), (turned * turns[0].inv()).as_matrix()
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ import numpy as np
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.parameters import ParameterSpace, SCALE
-from dlo_calibration.score import PointErrors, residuals, trial_score
+from dlo_calibration.score import PointErrors, residuals, TrialScore
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Rollout, Simulator
 from dlo_calibration.trial import Trial
@@ -147,6 +147,7 @@ class Evaluator:
         self.space = space
         self.simulator = simulator
         self._length = mean_length(trials)
+        self._scores = tuple(TrialScore(trial) for trial in trials)
 
     def simulate(self, values: Mapping[str, float],
                  should_stop: Callable[[], bool] = lambda: False) -> list[Rollout]:
@@ -176,8 +177,8 @@ class Evaluator:
                                    for trial, rollout in zip(self.trials, rollouts, strict=True)])
         return replace(
             blank,
-            scores=tuple(trial_score(trial, rollout.chains)
-                         for trial, rollout in zip(self.trials, rollouts, strict=True)),
+            scores=tuple(score(rollout.chains)
+                         for score, rollout in zip(self._scores, rollouts, strict=True)),
             errors=PointErrors.of(residual), residuals=frozen_array(residual),
             unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
                             if not all(rollout.settled)))

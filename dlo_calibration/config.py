@@ -138,6 +138,7 @@ class Options:
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
+        ParameterSpace(self.calibrate)  # refuses to find nothing, or something twice
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Options:

@@ -126,7 +126,7 @@ class ParameterSpace:
     @property
     def mass_known(self) -> bool:
         """Tell whether physical values can be given in absolute units."""
-        return self.mass > 0 or 'mass' in self.free
+        return self.mass > 0 or 'mass' in self.free or 'mass' in self.fixed
 
     def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
         """Return the free parameters, 0..100, of a (d,) point of the unit cube."""

@@ -38,7 +38,7 @@ def focal_point(trial: Trial, goal: Goal) -> int:
     """
     best, index = np.inf, 0
     for hand in trial.holding(goal):
-        position = hand.poses(goal.time)[0][0]
+        position = hand.positions_at(goal.time)[0]
         distances = np.linalg.norm(goal.chain.points - position, axis=1)
         if distances.min() < best:
             best, index = float(distances.min()), int(distances.argmin())
@@ -85,11 +85,23 @@ def difference_score(goal: Floats, current: Floats, reference: int,
     return float(np.linalg.norm(shape + place)) * CENTIMETRES
 
 
+class TrialScore:
+    """The difference score of one trial; what depends on its goals alone is found once."""
+
+    def __init__(self, trial: Trial) -> None:
+        self._goals = tuple((goal.chain.points, focal_point(trial, goal), feature_points(trial, goal))
+                            for goal in trial.goals)
+
+    def __call__(self, chains: Floats) -> float:
+        """Return the score [cm] of simulated (g, n, 3) [m] chains, averaged over the g goals."""
+        return float(np.mean([difference_score(points, chain, reference, features)
+                              for (points, reference, features), chain in zip(
+                                  self._goals, chains, strict=True)]))
+
+
 def trial_score(trial: Trial, chains: Floats) -> float:
     """Return the difference score of simulated (g, n, 3) chains, averaged over the g goals."""
-    return float(np.mean([
-        difference_score(goal.chain.points, chain, focal_point(trial, goal), feature_points(trial, goal))
-        for goal, chain in zip(trial.goals, chains, strict=True)]))
+    return TrialScore(trial)(chains)
 
 
 def residuals(trial: Trial, chains: Floats) -> Floats:

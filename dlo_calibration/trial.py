@@ -92,12 +92,12 @@ class Trial:
     @property
     def hands(self) -> tuple[Hand, ...]:
         """All hands of all actions, in the order of their start."""
-        return tuple(hand for action in self.actions for hand in action.hands)
+        return tuple(sorted((hand for action in self.actions for hand in action.hands),
+                            key=lambda hand: hand.start))
 
     def holding(self, goal: Goal) -> tuple[Hand, ...]:
         """Return the hands that hold the DLO when `goal` is observed, the last of each name."""
-        last = {hand.name: hand for hand in sorted(self.hands, key=lambda hand: hand.start)
-                if hand.start <= goal.time}
+        last = {hand.name: hand for hand in self.hands if hand.start <= goal.time}
         return tuple(hand for hand in last.values() if self.holds(hand, goal))
 
     def holds(self, hand: Hand, goal: Goal) -> bool:

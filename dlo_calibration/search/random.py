@@ -23,6 +23,8 @@ import numpy as np
 from dlo_calibration.chain import Floats
 from dlo_calibration.search.protocol import Observation
 
+BATCH = 50  # points asked at a time: enough to keep many processes busy, few enough to hold their residuals
+
 
 class RandomSearch:
     """
@@ -39,8 +41,8 @@ class RandomSearch:
         self._generator = np.random.default_rng(seed)
 
     def ask(self, limit: int) -> Floats:
-        """Return `limit` points (m, d): nothing that is told would change them."""
-        return self._generator.random((limit, self._dimension))
+        """Return the next points (m, d) of one random sequence, however it is divided."""
+        return self._generator.random((min(limit, BATCH), self._dimension))
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Ignore the results."""

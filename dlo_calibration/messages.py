@@ -1,0 +1,482 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Messages: the wire contract to dataclasses and back; duck-typed, imports no rclpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+import importlib
+from typing import Any, Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.action import MAXIMUM_HANDS
+from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.chain import Chain, Floats, frozen_array
+from dlo_calibration.errors import InputError
+
+INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
+INPUT_TYPES: Mapping[str, str] = {
+    INITIAL: 'sensor_msgs/msg/PointCloud2',
+    ACTION: 'trajectory_msgs/msg/MultiDOFJointTrajectory',
+    GOAL: 'sensor_msgs/msg/PointCloud2',
+}
+OUTPUT_TYPES: Mapping[str, str] = {
+    'progress': 'diagnostic_msgs/msg/DiagnosticArray',
+    'result': 'diagnostic_msgs/msg/DiagnosticArray',
+    'status': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+STATES = ('collecting', 'calibrating', 'done', 'failed')
+
+NANOSECONDS = 10**9  # in a second
+MAXIMUM_POINTS = 10_000  # of a chain; a whole camera image sent by mistake has more
+MAXIMUM_WAYPOINTS = 100_000  # of an action
+MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more
+MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start is longer
+INT8, UINT8, FLOAT32, FLOAT64 = 1, 2, 7, 8  # sensor_msgs/PointField
+FIELD_TYPES = {INT8: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32', 6: 'uint32',
+               FLOAT32: 'float32', FLOAT64: 'float64'}
+CODES = {UINT8: 'u1', FLOAT32: 'f4', FLOAT64: 'f8'}
+COORDINATES = ('x', 'y', 'z')
+ANNOTATIONS = ('hand', 'feature')
+OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
+VALUE_UNIT = '0..100'  # of value, std, lower and upper of a result
+WHOLE = 'calibration'  # name of the status that speaks of the whole result
+
+
+def named(kind: str, stamp: int) -> str:
+    """Name a message as refusals do, e.g. ``goal_chain stamped 12.5 s``; `stamp` in ns."""
+    sign, (seconds, rest) = '-' if stamp < 0 else '', divmod(abs(stamp), NANOSECONDS)
+    return f'{kind} stamped {sign}{seconds}{f".{rest:09d}".rstrip("0").rstrip(".")} s'
+
+
+def _check_stamp(kind: str, stamp: int) -> None:
+    if stamp <= 0:
+        raise InputError(named(kind, stamp), 'a stamp of zero' if stamp == 0 else 'a negative stamp',
+                         'the time of the observation', 'set header.stamp')
+
+
+def _check_size(thing: str, what: str, positions: Floats) -> None:
+    """Refuse finite coordinates [m] whose squares would not be; `positions` is (n, ...)."""
+    rows = positions.reshape(len(positions), positions[:1].size)
+    bad = np.argwhere(np.isfinite(rows) & (np.abs(rows) > MAXIMUM_COORDINATE))
+    if len(bad):
+        raise InputError(thing, f'a coordinate of {rows[tuple(bad[0])]:g} m in {what} {bad[0][0]}',
+                         f'at most {MAXIMUM_COORDINATE:g} m',
+                         'send metres, in the byte order that the message tells')
+
+
+@dataclass(frozen=True)
+class ChainMessage:
+    """
+    An observed chain.
+
+    :param kind: INITIAL or GOAL.
+    :param stamp: when it was observed [ns], > 0.
+    :param chain: its `hands` is None where the cloud has no `hand` field.
+    """
+
+    kind: str
+    stamp: int
+    frame_id: str
+    chain: Chain
+
+    def __post_init__(self) -> None:
+        _check_stamp(self.kind, self.stamp)
+
+    def __str__(self) -> str:
+        return named(self.kind, self.stamp)
+
+    @cached_property
+    def length(self) -> float:
+        """Length of the curve through the points [m]."""
+        return self.chain.length
+
+
+@dataclass(frozen=True)
+class ActionMessage:
+    """
+    What hands did.
+
+    :param stamp: when `times` begin to count [ns], > 0.
+    :param names: of the h hands, 1 to 8, all different.
+    :param times: (k,) of the waypoints [s], increasing, none negative.
+    :param positions: (k, h, 3) [m].
+    :param orientations: (k, h, 4) quaternions x y z w.
+    """
+
+    stamp: int
+    frame_id: str
+    names: tuple[str, ...]
+    times: Floats
+    positions: Floats
+    orientations: Floats
+
+    def __post_init__(self) -> None:
+        names = tuple(self.names)
+        times, positions, orientations = map(
+            frozen_array, (self.times, self.positions, self.orientations))
+        _check_stamp(ACTION, self.stamp)
+        thing = str(self)
+        if not 1 <= len(names) <= MAXIMUM_HANDS:
+            raise InputError(thing, f'{len(names)} joint_names', f'1 to {MAXIMUM_HANDS}',
+                             'name the hands that hold the DLO, and only those')
+        if len(set(names)) < len(names) or '' in names:
+            raise InputError(thing, f'joint_names {list(names)}', 'a different name for each hand',
+                             'correct joint_names')
+        count = len(times)
+        if count == 0:
+            raise InputError(thing, 'no trajectory points', 'at least one',
+                             'send where the hands closed, moved and opened')
+        if times.shape != (count,) or positions.shape != (count, len(names), 3) \
+                or orientations.shape != (count, len(names), 4):
+            raise InputError(
+                thing, f'times {times.shape}, positions {positions.shape}, orientations '
+                f'{orientations.shape}', '(k,), (k, h, 3) and (k, h, 4) for k waypoints of h hands',
+                'give every hand one pose per waypoint')
+        for name, values in (('time_from_start', times), ('translation', positions),
+                             ('rotation', orientations)):
+            bad = np.flatnonzero(~np.isfinite(values.reshape(count, -1)).all(axis=1))
+            if len(bad):
+                raise InputError(thing, f'NaN or infinity in {name} of trajectory point {bad[0]}',
+                                 'finite numbers', 'leave such points out')
+        _check_size(thing, 'trajectory point', positions)
+        if times[0] < 0 or times[-1] > MAXIMUM_DURATION:
+            raise InputError(thing, f'time_from_start from {times[0]:g} to {times[-1]:g} s',
+                             f'0 to {MAXIMUM_DURATION:g} s', 'count time_from_start from header.stamp')
+        bad = np.flatnonzero(np.diff(times) <= 0)
+        if len(bad):
+            k = bad[0]
+            raise InputError(
+                thing, f'time_from_start {times[k + 1]:g} s of trajectory point {k + 1} after {times[k]:g} s',
+                'increasing times', 'sort the points and leave out repeated ones')
+        # one bound with Hand, which normalises
+        norms = np.linalg.norm(orientations, axis=2)
+        if (norms < 0.5).any():
+            k, h = np.argwhere(norms < 0.5)[0]
+            raise InputError(
+                thing, f'a quaternion of length {norms[k, h]:g} for {names[h]} in trajectory point {k}',
+                'a unit quaternion x y z w', 'use 0 0 0 1 for a hand that does not turn')
+        for name, value in (('names', names), ('times', times), ('positions', positions),
+                            ('orientations', orientations)):
+            object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        return named(ACTION, self.stamp)
+
+    @property
+    def kind(self) -> str:
+        """Always ACTION."""
+        return ACTION
+
+
+def read(kind: str, message: Any) -> ChainMessage | ActionMessage:
+    """
+    Read a message of an input topic.
+
+    :param kind: INITIAL, ACTION or GOAL.
+    :param message: an rclpy or `rosbags` object, or anything with the same attributes.
+    :raises InputError: where it cannot be used, with a text that names it.
+    """
+    stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+    _check_stamp(kind, stamp)
+    if kind == ACTION:
+        return _read_action(message, stamp)
+    return _read_chain(kind, message, stamp)
+
+
+def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
+    thing = named(kind, stamp)
+    width, height, step = int(cloud.width), int(cloud.height), int(cloud.point_step)
+    if 1 not in (width, height):
+        raise InputError(thing, f'height {height} and width {width}', 'height 1 or width 1',
+                         'send the ordered points along the DLO, not an image')
+    count = width * height
+    if count > MAXIMUM_POINTS:
+        raise InputError(thing, f'{count} points', f'at most {MAXIMUM_POINTS}',
+                         'send the points along the DLO, not the whole scene')
+    if count and step > len(cloud.data):
+        raise InputError(thing, f'{len(cloud.data)} bytes of data', f'{count} points of {step} bytes',
+                         'send all points, or correct point_step')
+    dtype = _point_type(thing, cloud, step)
+    stride = step
+    if height > 1:
+        stride = int(cloud.row_step)
+        if stride < step:
+            raise InputError(thing, f'row_step {stride} below point_step {step}',
+                             'rows of at least one point', 'correct row_step')
+    needed = max((count - 1) * stride + step, 0) if count else 0
+    if len(cloud.data) < needed:
+        raise InputError(thing, f'{len(cloud.data)} bytes of data',
+                         f'{needed} for {count} points of {step} bytes',
+                         'send all points, or correct width, height and point_step')
+    octets = np.frombuffer(cloud.data, np.uint8) if count else np.zeros(0, np.uint8)
+    table = np.ndarray((count,), dtype, octets, strides=(stride,))
+    hands = table['hand'] if 'hand' in dtype.fields else None  # type: ignore[operator]
+    features = table['feature'] != 0 if 'feature' in dtype.fields else None  # type: ignore[operator]
+    if hands is not None and (hands > MAXIMUM_HANDS).any():
+        raise InputError(thing, f'hand {hands.max()}', f'0 for none, or 1 to {MAXIMUM_HANDS}',
+                         'number the hands as in joint_names of the action')
+    points = np.stack([table[name].astype(float) for name in COORDINATES], axis=1)
+    _check_size(thing, 'point', points)
+    try:
+        chain = Chain(points, hands, features)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(thing, error.came, error.expected, error.remedy) from error
+    return ChainMessage(kind, stamp, cloud.header.frame_id, chain)
+
+
+def _point_type(thing: str, cloud: Any, step: int) -> np.dtype[Any]:
+    """Return the dtype of one point: the fields that matter, at their places."""
+    wanted = {**dict.fromkeys(COORDINATES, (FLOAT32, FLOAT64)), **dict.fromkeys(ANNOTATIONS, (UINT8,))}
+    found: dict[str, tuple[str, int]] = {}
+    order = '>' if cloud.is_bigendian else '<'
+    for one in cloud.fields:
+        if one.name not in wanted:
+            continue
+        if one.name in found:
+            raise InputError(thing, f'two fields {one.name!r}', 'one', 'give every field its own name')
+        if one.datatype not in wanted[one.name] or one.count != 1:
+            came = FIELD_TYPES.get(one.datatype, f'of datatype {one.datatype}')
+            raise InputError(thing, f'field {one.name!r} {came} (count {one.count})',
+                             f'{" or ".join(FIELD_TYPES[t] for t in wanted[one.name])} (count 1)',
+                             'send it in that type' if one.name in COORDINATES else
+                             'send it in that type, or under another name if it means something else')
+        code = np.dtype(order + CODES[one.datatype])
+        if one.offset + code.itemsize > step:
+            raise InputError(thing, f'field {one.name!r} at offset {one.offset} of points of {step} bytes',
+                             'fields inside the point', 'correct offset or point_step')
+        found[one.name] = (code.str, one.offset)
+    missing = [name for name in COORDINATES if name not in found]
+    if missing:
+        names = ' '.join(one.name for one in cloud.fields) or 'none'
+        raise InputError(thing, f'no field {" ".join(missing)} (fields: {names})', 'fields x y z',
+                         'send the coordinates in metres under these names')
+    return np.dtype({'names': list(found), 'formats': [code for code, _ in found.values()],
+                     'offsets': [offset for _, offset in found.values()], 'itemsize': step})
+
+
+def _read_action(message: Any, stamp: int) -> ActionMessage:
+    thing = named(ACTION, stamp)
+    names, points = tuple(message.joint_names), message.points
+    if len(points) > MAXIMUM_WAYPOINTS:
+        raise InputError(thing, f'{len(points)} trajectory points', f'at most {MAXIMUM_WAYPOINTS}',
+                         'send fewer; between points a hand moves at constant speed')
+    for k, point in enumerate(points):
+        if len(point.transforms) != len(names):
+            raise InputError(thing, f'{len(point.transforms)} transforms in trajectory point {k}',
+                             f'one for each of the {len(names)} joint_names',
+                             'give every hand a transform in every point')
+    moves = [(t.translation, t.rotation) for point in points for t in point.transforms]
+    shape = (len(points), len(names))
+    return ActionMessage(
+        stamp, message.header.frame_id, names,
+        np.array([(p.time_from_start.sec * NANOSECONDS + p.time_from_start.nanosec) / NANOSECONDS
+                  for p in points], dtype=float),
+        np.array([(p.x, p.y, p.z) for p, _ in moves], dtype=float).reshape(*shape, 3),
+        np.array([(q.x, q.y, q.z, q.w) for _, q in moves], dtype=float).reshape(*shape, 4))
+
+
+@dataclass(frozen=True)
+class MessageTypes:
+    """
+    Where message classes come from, and what they want in two kinds of field.
+
+    :param find: class of a type name such as ``std_msgs/msg/Header``.
+    :param octets: value of a ``uint8[]`` field.
+    :param level: value of a ``byte`` field.
+    """
+
+    find: Callable[[str], Any]
+    octets: Callable[[bytes], Any]
+    level: Callable[[int], Any]
+
+    def build(self, type_name: str, **fields: Any) -> Any:
+        """Build a message; all its fields must be given."""
+        return self.find(type_name)(**fields)
+
+    def header(self, stamp: int, frame_id: str = '') -> Any:
+        """Build a header; `stamp` in ns."""
+        seconds, rest = divmod(stamp, NANOSECONDS)
+        return self.build('std_msgs/msg/Header', frame_id=frame_id, stamp=self.build(
+            'builtin_interfaces/msg/Time', sec=seconds, nanosec=rest))
+
+
+def rclpy_types() -> MessageTypes:
+    """Return the message classes of the ROS 2 installation."""
+    from array import array
+
+    def find(type_name: str) -> Any:
+        package, _, name = type_name.split('/')
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+
+    return MessageTypes(find, lambda octets: array('B', octets), lambda level: bytes([level]))
+
+
+def bag_types() -> MessageTypes:
+    """Return the message classes of the library `rosbags`, which needs no ROS installation."""
+    from rosbags.typesys import get_typestore, Stores
+
+    return MessageTypes(get_typestore(Stores.ROS2_JAZZY).types.__getitem__,
+                        lambda octets: np.frombuffer(octets, np.uint8), int)
+
+
+def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str, *,
+                single: bool = False) -> Any:
+    """
+    Build a PointCloud2: x y z, and `hand` and `feature` where they are annotated.
+
+    :param stamp: [ns].
+    :param single: coordinates as float32; else float64, which loses nothing.
+    """
+    number = FLOAT32 if single else FLOAT64
+    columns: list[tuple[str, int, NDArray[Any]]] = [
+        (name, number, chain.points[:, axis]) for axis, name in enumerate(COORDINATES)]
+    if chain.hands is not None:
+        columns.append(('hand', UINT8, chain.hands))
+    if chain.features.any():
+        columns.append(('feature', UINT8, chain.features))
+    dtype = np.dtype([(name, '<' + CODES[datatype]) for name, datatype, _ in columns])
+    table = np.empty(len(chain), dtype)
+    for name, _, values in columns:
+        table[name] = values
+    fields = [types.build('sensor_msgs/msg/PointField', name=name, datatype=datatype, count=1,
+                          offset=dtype.fields[name][1])  # type: ignore[index]
+              for name, datatype, _ in columns]
+    return types.build(
+        'sensor_msgs/msg/PointCloud2', header=types.header(stamp, frame_id), height=1, width=len(chain),
+        fields=fields, is_bigendian=False, point_step=dtype.itemsize,
+        row_step=dtype.itemsize * len(chain), data=types.octets(table.tobytes()), is_dense=True)
+
+
+def action_trajectory(types: MessageTypes, action: ActionMessage) -> Any:
+    """Build a MultiDOFJointTrajectory; times are rounded to ns."""
+    points = []
+    for time, positions, orientations in zip(
+            action.times, action.positions.tolist(), action.orientations.tolist(), strict=True):
+        seconds, rest = divmod(round(float(time) * NANOSECONDS), NANOSECONDS)
+        transforms = [
+            types.build('geometry_msgs/msg/Transform',
+                        translation=types.build('geometry_msgs/msg/Vector3', x=x, y=y, z=z),
+                        rotation=types.build('geometry_msgs/msg/Quaternion', x=qx, y=qy, z=qz, w=qw))
+            for (x, y, z), (qx, qy, qz, qw) in zip(positions, orientations, strict=True)]
+        points.append(types.build(
+            'trajectory_msgs/msg/MultiDOFJointTrajectoryPoint', transforms=transforms, velocities=[],
+            accelerations=[], time_from_start=types.build(
+                'builtin_interfaces/msg/Duration', sec=seconds, nanosec=rest)))
+    return types.build('trajectory_msgs/msg/MultiDOFJointTrajectory', points=points,
+                       header=types.header(action.stamp, action.frame_id), joint_names=list(action.names))
+
+
+def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: Evaluation, evaluations: int,
+             simulations_per_second: float, seconds_left: float) -> Any:
+    """
+    Build the message about one finished evaluation.
+
+    :param evaluation: the one that has finished; counted from 1 in the message.
+    :param best: the best so far.
+    :param evaluations: how many there will be.
+    """
+    values: dict[str, Any] = {
+        'evaluation': evaluation.index + 1, 'evaluations': evaluations, 'score': evaluation.score,
+        'best_score': best.score, **{f'best_{name}': value for name, value in best.values.items()},
+        'simulations_per_second': simulations_per_second, 'seconds_left': seconds_left}
+    if evaluation.failure:
+        values['failure'] = evaluation.failure
+    message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {best.score:.1f}, '
+               f'{seconds_left:.0f} s left')
+    level = WARN if evaluation.failure else OK
+    return _diagnostics(types, stamp, [_status(types, level, 'progress', message, values)])
+
+
+def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
+    """Build the message with the final parameter set: one status per parameter, one for the whole."""
+    statuses = []
+    for name, p in found.parameters.items():
+        message = f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), {p.physical_value:.3g} {p.physical_unit}'
+        if not p.identifiable:
+            message += '; the trials could not tell it'
+        statuses.append(_status(types, OK if p.identifiable else WARN, name, message, {
+            'value': p.value, 'std': p.std, 'lower': p.lower, 'upper': p.upper, 'unit': VALUE_UNIT,
+            'physical_value': p.physical_value, 'physical_lower': p.physical_lower,
+            'physical_upper': p.physical_upper, 'physical_unit': p.physical_unit,
+            'identifiable': p.identifiable}))
+    errors = found.errors
+    statuses.append(_status(
+        types, WARN if found.warnings else OK, WHOLE,
+        f'score {found.best.score:.1f}, mean error {errors.mean * 1e3:.2f} mm; {found.stop_reason}', {
+            'score': found.best.score, 'scores': ' '.join(repr(float(s)) for s in found.best.scores),
+            'mean_error_mm': errors.mean * 1e3, 'rms_error_mm': errors.rms * 1e3,
+            'max_error_mm': errors.max * 1e3, 'mean_abs_error_mm': errors.mean_abs * 1e3,
+            'error_percent_of_length': 100 * errors.mean / found.length,
+            'trials': len(found.trials), 'evaluations': len(found.evaluations),
+            'simulations': found.simulations, 'seconds': found.seconds, 'engine': found.engine,
+            'search': found.search, 'seed': '' if found.seed is None else found.seed,
+            'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings)}))
+    return _diagnostics(types, stamp, statuses)
+
+
+def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
+    """Read the parameters of a `result` message: name -> key -> number, text or truth."""
+    found: dict[str, dict[str, float | str | bool]] = {}
+    for one in message.status:
+        if one.name != WHOLE:
+            values = {pair.key: pair.value for pair in one.values}
+            found[one.name] = {
+                key: value == 'true' if key == 'identifiable' else
+                value if key.endswith('unit') else float(value) for key, value in values.items()}
+    return found
+
+
+def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
+           incomplete: str = '', detail: str = '') -> Any:
+    """
+    Build the message about what the node is doing.
+
+    :param state: one of STATES.
+    :param trials: number of complete trials.
+    :param last_refusal: text of the last refusal; empty where there was none.
+    :param incomplete: what the newest trial lacks; empty where nothing.
+    :param detail: of the state, e.g. why it failed.
+    """
+    if state not in STATES:
+        raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
+    message = f'{state}: {detail}' if detail else state
+    return _diagnostics(types, stamp, [_status(
+        types, ERROR if state == 'failed' else OK, 'status', message,
+        {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
+         'detail': detail})])
+
+
+def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:
+    return types.build('diagnostic_msgs/msg/DiagnosticArray', header=types.header(stamp),
+                       status=list(statuses))
+
+
+def _status(types: MessageTypes, level: int, name: str, message: str, values: Mapping[str, Any]) -> Any:
+    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=_text(value))
+             for key, value in values.items()]
+    return types.build('diagnostic_msgs/msg/DiagnosticStatus', level=types.level(level), name=name,
+                       message=message, hardware_id='', values=pairs)
+
+
+def _text(value: Any) -> str:
+    """Return text that reads back exactly."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -1,0 +1,513 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Trials follow from the stamps of the messages, not from the order of their arrival."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from dlo_calibration import collector as module
+from dlo_calibration.chain import Chain
+from dlo_calibration.collector import TrialCollector
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.messages import ActionMessage, ChainMessage, GOAL, INITIAL
+
+START = 1_700_000_000.0
+
+
+def ns(seconds):
+    return round((START + seconds) * 1000) * 1_000_000
+
+
+def chain(kind, at, *, move=0.0, count=11, length=1.0, hands=None, frame='world'):
+    points = np.zeros((count, 3))
+    points[:, 0] = np.linspace(0, length, count)
+    points[:, 1] = move
+    return ChainMessage(kind, ns(at), frame, Chain(points, hands))
+
+
+def initial(at, **rest):
+    return chain(INITIAL, at, **rest)
+
+
+def goal(at, **rest):
+    return chain(GOAL, at, **rest)
+
+
+def action(at, times=(0.0, 1.0), names=('left_hand',), grips=(0,), away=0.0, frame='world', length=1.0):
+    """Hands that close `away` from points of a straight chain of 11, and rise."""
+    positions = np.zeros((len(times), len(names), 3))
+    positions[:, :, 0] = np.array(grips) / 10 * length
+    positions[:, :, 1] = away
+    positions[:, :, 2] = np.linspace(0, 0.1, len(times))[:, None]
+    orientations = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), len(names), 1))
+    return ActionMessage(ns(at), frame, names, np.array(times), positions, orientations)
+
+
+def collect(*messages, **options):
+    collector = TrialCollector(Options(**options))
+    for message in messages:
+        collector.add(message)
+    return collector
+
+
+def only(*messages, **options):
+    trial, = collect(*messages, **options).trials
+    return trial
+
+
+def refused(collector, message):
+    """Return the refusal's text; it names the message, and the trials stay as they were."""
+    before = contents(collector.trials)
+    with pytest.raises(InputError) as caught:
+        collector.add(message)
+    assert contents(collector.trials) == before
+    text = str(caught.value)
+    assert text.startswith(f'{message}: got ')
+    return text
+
+
+def contents(trials):
+    """Return all that trials hold, comparable."""
+    def octets(array):
+        return None if array is None else (array.shape, array.tobytes())
+
+    return [(t.name, octets(t.initial.points), octets(t.initial.hands), octets(t.velocity),
+             [[(h.name, h.grips, octets(h.times), octets(h.positions), octets(h.orientations))
+               for h in a.hands] for a in t.actions],
+             [(octets(g.chain.points), g.time, g.stable, g.held_by) for g in t.goals]) for t in trials]
+
+
+# ---- what makes a trial
+
+def test_one_chain_of_each_and_an_action_make_a_trial():
+    collector = collect(initial(1), action(2), goal(10, move=0.3))
+    assert collector.count == 1
+    trial, = collector.trials
+    assert trial.name == 'trial 1'
+    assert trial.velocity is None
+    hand, = trial.hands
+    assert (hand.name, hand.grips) == ('left_hand', (0,))
+    np.testing.assert_allclose(trial.goals[0].chain.points[:, 1], 0.3)
+
+
+def test_initial_chain_after_a_goal_or_an_action_begins_the_next_trial():
+    trials = collect(
+        initial(1), action(2), goal(5), initial(6, move=0.1), action(7, away=0.1), goal(9), goal(10),
+        initial(11), action(12), initial(13, move=0.2), action(14, away=0.2), goal(16)).trials
+    assert [t.name for t in trials] == ['trial 1', 'trial 2', 'trial 3']
+    assert [t.initial.points[0, 1] for t in trials] == [0, 0.1, 0.2]
+    assert [len(t.goals) for t in trials] == [1, 2, 1]
+
+
+def test_message_order_at_equal_stamps_is_initial_action_goal():
+    trial = only(goal(1), action(1), initial(1))
+    assert len(trial.actions) == len(trial.goals) == 1
+
+
+def test_two_hands_may_send_actions_of_their_own_at_one_instant():
+    trial = only(initial(1), action(2), action(2, names=('right_hand',), grips=(10,)), goal(9))
+    assert [hand.name for hand in trial.hands] == ['left_hand', 'right_hand']
+
+
+def test_clear_forgets_all():
+    collector = collect(initial(1), action(2), goal(5))
+    collector.clear()
+    assert (collector.trials, collector.count, collector.incomplete, collector.problems) == ((), 0, '', ())
+    collector.add(initial(1, frame='map'))
+    assert 'action' in collector.incomplete
+
+
+# ---- the start
+
+def test_last_initial_chain_in_a_row_is_where_the_dlo_is():
+    trial = only(initial(1), initial(2, move=0.1), initial(3, move=0.2), action(4, away=0.2), goal(9))
+    np.testing.assert_allclose(trial.initial.points[:, 1], 0.2)
+    assert trial.velocity is None
+
+
+@pytest.mark.parametrize(('elapsed', 'moving'), [(0.04, True), (0.099, True), (0.1, False), (3, False)])
+def test_earlier_chain_less_than_a_tenth_of_a_second_older_gives_the_velocity(elapsed, moving):
+    trial = only(initial(2 - elapsed), initial(2, move=0.02), action(2.5, away=0.02), goal(9))
+    if moving:
+        np.testing.assert_allclose(trial.velocity, np.tile([0, 0.02 / elapsed, 0], (11, 1)))
+    else:
+        assert trial.velocity is None
+
+
+def test_of_several_earlier_chains_the_latest_gives_the_velocity():
+    trial = only(initial(1.94), initial(1.97, move=0.01), initial(2, move=0.016), action(2.5), goal(9))
+    np.testing.assert_allclose(trial.velocity[:, 1], 0.2)
+
+
+def test_chain_with_other_points_gives_no_velocity():
+    assert only(initial(1.97, count=12), initial(2), action(2.5), goal(9)).velocity is None
+
+
+def test_goal_between_two_initial_chains_parts_them():
+    assert only(initial(1.97), goal(1.98), initial(2), action(2.5), goal(9)).velocity is None
+
+
+def test_clock_of_a_moving_start_begins_with_the_chain():
+    trial = only(initial(1.97), initial(2, move=0.01), action(3, times=(0.5, 1.5)), goal(4), goal(6))
+    np.testing.assert_array_equal(trial.hands[0].times, [1.5, 2.5])
+    assert [g.time for g in trial.goals] == [2.0, 4.0]
+
+
+def test_clock_of_a_start_at_rest_begins_when_the_first_hand_closes():
+    trial = only(initial(2), action(30, times=(0.5, 1.5)), goal(31), goal(33))
+    np.testing.assert_array_equal(trial.hands[0].times, [0, 1])
+    assert [g.time for g in trial.goals] == [0.5, 2.5]
+
+
+def test_clock_never_shows_a_negative_time():
+    trial = only(initial(2), action(3, times=(5.0, 6.0)), goal(4), action(3.5), goal(20))
+    assert [a.start for a in trial.actions] == [0.0, 4.5]
+    trial = only(initial(2), action(3, times=(5.0, 6.0)), goal(4), goal(20))
+    assert [g.time for g in trial.goals] == [0.0, 16.0]
+    assert trial.actions[0].start == 4.0
+
+
+# ---- other options
+
+def test_other_options_judge_the_same_messages_again():
+    collector = collect(initial(1), action(2), goal(5))
+    refused(collector, goal(6, length=1.7))
+    wide = collector.with_options(Options(length_tolerance=100.0, release=False))
+    assert [g.held_by for g in wide.trials[0].goals] == [('left_hand',)] * 2
+    assert wide.problems == ()
+    assert [len(t.goals) for t in collector.trials] == [1]
+    assert contents(wide.with_options(Options()).trials) == contents(collector.trials)
+    assert "expected 'world'" in refused(wide, initial(8, frame='map'))
+
+
+# ---- frames and repetitions
+
+def test_another_frame_is_refused():
+    collector = collect(initial(1))
+    for message in (action(2, frame='map'), goal(3, frame=''), initial(4, frame='map')):
+        text = refused(collector, message)
+        assert f"frame_id {message.frame_id!r}, expected 'world'" in text
+
+
+def test_repeated_stamp_is_refused():
+    collector = collect(initial(1), action(2), goal(5))
+    for message in (initial(1, move=1), action(2, away=0.01), goal(5, move=1)):
+        assert f'a second {message.kind} with this stamp' in refused(collector, message)
+
+
+def test_corrected_message_may_have_the_stamp_of_the_refused_one():
+    collector = collect(initial(1))
+    refused(collector, action(2, away=0.5))
+    collector.add(action(2))
+    refused(collector, goal(5, count=10))
+    assert 'an action' not in collector.incomplete
+    collector.add(goal(5))
+    assert (collector.count, collector.problems) == (1, ())
+
+
+# ---- grips
+
+def test_hand_grips_the_points_annotated_with_its_number():
+    hands = [1, 1, 0, 0, 0, 0, 0, 0, 2, 2, 2]
+    trial = only(initial(1, hands=hands), action(2, names=('a', 'b'), grips=(5, 6), away=3), goal(9))
+    assert [hand.grips for hand in trial.hands] == [(0, 1), (8, 9, 10)]
+
+
+def test_hand_without_annotation_grips_the_nearest_point():
+    hands = [1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]
+    trial = only(initial(1, hands=hands), action(2, names=('a', 'b'), grips=(5, 6), away=0.019), goal(9))
+    assert [hand.grips for hand in trial.hands] == [(0, 1), (6,)]
+
+
+def test_hand_that_closes_too_far_away_is_refused():
+    collector = collect(initial(1))
+    text = refused(collector, action(2, away=0.03))
+    assert 'left_hand closing 0.03 m from any point of initial_chain' in text
+    assert 'at most 0.02 m (grip_tolerance)' in text
+    collector = collect(initial(1), grip_tolerance=0.05)
+    collector.add(action(2, away=0.03))
+
+
+def test_two_hands_at_one_point_are_refused():
+    collector = collect(initial(1))
+    assert 'two hands that grip point 5' in refused(collector, action(2, names=('a', 'b'), grips=(5, 5)))
+
+
+def test_later_action_grips_where_the_latest_chain_is():
+    trial = only(initial(1), action(2), goal(4, move=0.3), action(5, grips=(7,), away=0.3), goal(9))
+    assert [a.hands[0].grips for a in trial.actions] == [(0,), (7,)]
+    collector = collect(initial(1), action(2), goal(4, move=0.3))
+    assert 'from any point of goal_chain' in refused(collector, action(5))
+
+
+def test_annotation_of_a_goal_counts_in_the_action_before_it():
+    held = [0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0]
+    trial = only(initial(1), action(2, names=('a',), grips=(3,)), goal(4, hands=held),
+                 action(5, names=('b', 'a'), grips=(9, 3)), goal(9))
+    assert [(h.name, h.grips) for h in trial.actions[1].hands] == [('b', (9,)), ('a', (3, 4))]
+    trial = only(initial(1), action(2, names=('a',), grips=(3,)), goal(4, hands=held),
+                 action(5, names=('b',), grips=(9,)), action(6, names=('a',), grips=(3,)), goal(9))
+    assert [a.hands[0].grips for a in trial.actions] == [(3,), (9,), (3, 4)]
+
+
+# ---- goals
+
+@pytest.mark.parametrize(('at', 'stable'), [
+    (2.5, False), (3, False), (4, False), (5, False), (5.001, True), (60, True)])
+def test_goal_is_timed_until_the_last_waypoint(at, stable):
+    trial = only(initial(1), action(2, times=(1.0, 3.0)), goal(at))
+    assert trial.goals[0].stable is stable
+
+
+def test_goal_between_actions_is_stable_and_one_while_any_hand_moves_is_not():
+    first, second = action(2, times=(0.0, 4.0)), action(3, names=('b',), grips=(9,), times=(5.0, 8.0))
+    trial = only(initial(1), first, second, goal(5), goal(7), goal(9), goal(11), goal(12))
+    assert [g.stable for g in trial.goals] == [False, True, False, False, True]
+
+
+def test_annotated_goal_tells_which_hands_hold():
+    both = action(2, names=('a', 'b'), grips=(0, 9))
+    trial = only(initial(1), both, goal(4, hands=[0] * 9 + [2, 2]), goal(5, hands=[0] * 11), goal(6))
+    assert [g.held_by for g in trial.goals] == [('b',), (), ()]
+    trial = only(initial(1), both, goal(4, hands=[0] * 9 + [2, 2]), goal(5, hands=[0] * 11), goal(6),
+                 release=False)
+    assert [g.held_by for g in trial.goals] == [('b',), (), ('a', 'b')]
+
+
+def test_hand_that_never_opens_holds_in_every_goal_after_it_arrived():
+    trial = only(initial(1), action(2, names=('a',)), goal(2.5), goal(4),
+                 action(5, names=('b',), grips=(9,)), goal(5.5), goal(7), release=False)
+    assert [g.held_by for g in trial.goals] == [(), ('a',), ('a',), ('a', 'b')]
+
+
+def test_goal_that_annotates_a_hand_that_was_not_there_is_refused():
+    collector = collect(initial(1), action(2))
+    text = refused(collector, goal(4, hands=[2] + [0] * 10))
+    assert 'points held by hand 2, expected hands 1 to 1 as in action' in text
+
+
+def test_goal_with_other_points_is_refused():
+    collector = collect(initial(1), action(2), goal(4))
+    assert '12 points, expected 11 points as in initial_chain' in refused(collector, goal(5, count=12))
+
+
+@pytest.mark.parametrize(('length', 'tolerance', 'fits'), [
+    (1.49, 50, True), (1.51, 50, False), (0.51, 50, True), (0.49, 50, False), (1.0, 0, True),
+    (1.01, 0, False)])
+def test_goal_of_another_length_is_refused(length, tolerance, fits):
+    collector = collect(initial(1), action(2), length_tolerance=tolerance)
+    if fits:
+        collector.add(goal(4, length=length))
+        assert collector.count == 1
+    else:
+        assert f'at most {tolerance} % (length_tolerance)' in refused(collector, goal(4, length=length))
+
+
+# ---- what comes late
+
+def test_action_may_be_told_after_the_goals_that_were_observed_meanwhile():
+    collector = collect(initial(1), *(goal(k / 10) for k in range(21, 50)))
+    assert collector.incomplete.startswith('an action after initial_chain')
+    assert '29 goal_chain waiting' in collector.incomplete
+    collector.add(action(2, times=(0.0, 2.0)))
+    trial, = collector.trials
+    assert [g.stable for g in trial.goals] == [False] * 20 + [True] * 9
+
+
+def test_late_goal_joins_the_trial_that_it_belongs_to():
+    collector = collect(initial(1), action(2), goal(5), initial(6), action(7), goal(9))
+    collector.add(goal(4))
+    assert [len(t.goals) for t in collector.trials] == [2, 1]
+
+
+def test_late_initial_chain_divides_a_trial():
+    collector = collect(initial(1), action(2), goal(5), action(7), goal(9))
+    assert collector.count == 1
+    collector.add(initial(6))
+    assert [len(t.actions) for t in collector.trials] == [1, 1]
+
+
+def test_late_action_divides_a_row_of_initial_chains():
+    collector = collect(initial(1), initial(1.05, move=0.01), initial(8), action(9), goal(11))
+    collector.add(goal(5))
+    collector.add(action(2, away=0.01))
+    assert [t.initial.points[0, 1] for t in collector.trials] == [0.01, 0]
+    assert collector.trials[0].velocity is not None
+
+
+def test_refused_action_is_used_when_its_start_arrives_late():
+    collector = collect(initial(1), action(2), goal(5))
+    refused(collector, action(7, away=0.5))
+    assert len(collector.problems) == 1
+    collector.add(initial(6, move=0.5))
+    collector.add(goal(9))
+    assert (collector.count, collector.problems) == (2, ())
+
+
+def test_refused_message_does_not_end_a_row_of_initial_chains():
+    collector = collect(initial(1.95))
+    refused(collector, action(1.97, away=0.5))
+    for message in (initial(2, move=0.01), action(3), goal(9)):
+        collector.add(message)
+    trial, = collector.trials
+    np.testing.assert_allclose(trial.velocity[:, 1], 0.2)
+
+
+def test_messages_before_any_initial_chain_wait_for_it():
+    collector = collect(action(2), goal(5))
+    assert collector.incomplete.startswith('an initial_chain before action stamped')
+    assert collector.trials == ()
+    collector.add(initial(1))
+    assert collector.count == 1
+
+
+def test_messages_stamped_before_every_initial_chain_are_refused():
+    collector = collect(initial(5))
+    for message in (action(2), goal(3)):
+        text = refused(collector, message)
+        assert f'no initial_chain before it, expected one stamped earlier (the first is {initial(5)})' in text
+    assert [p.thing for p in collector.problems] == [str(action(2))]
+    collector.add(initial(1))
+    assert (collector.count, collector.problems) == (1, ())
+
+
+# ---- what status tells
+
+def test_incomplete_tells_what_the_newest_trial_lacks():
+    collector = collect()
+    assert collector.incomplete == ''
+    collector.add(initial(1))
+    assert collector.incomplete == f'an action after {initial(1)}, and a goal_chain'
+    collector.add(goal(1.5))
+    assert collector.incomplete == f'an action after {initial(1)} (1 goal_chain waiting for it)'
+    collector.add(action(2))
+    assert collector.incomplete == f'a goal_chain after {action(2)}; {goal(1.5)} is before it'
+    collector.add(goal(5))
+    assert collector.incomplete == ''
+
+
+def test_trial_that_the_next_one_cuts_off_is_a_problem():
+    collector = collect(initial(1), action(2), initial(3))
+    problem, = collector.problems
+    assert f'no goal_chain between {action(2)} and {initial(3)}' in str(problem)
+    collector.add(goal(2.5))
+    assert (collector.problems, collector.count) == ((), 1)
+
+
+def test_same_trial_object_as_long_as_nothing_changes():
+    collector = collect(initial(1), action(2), goal(5))
+    before, = collector.trials
+    collector.add(initial(6))
+    assert collector.trials[0] is before
+    collector.add(goal(5.5))
+    assert len(collector.trials[0].goals) == 2
+
+
+# ---- long streams
+
+def test_hour_of_initial_chains_is_one_start(monkeypatch):
+    monkeypatch.setattr(module, 'KEPT', 100)
+    collector = TrialCollector(Options())
+    first = initial(0)
+    for k in range(2000):
+        collector.add(replace(first, stamp=first.stamp + k * 33_000_000))
+    text = refused(collector, action(10))
+    assert 'after more than 50 messages that are later' in text
+    collector.add(action(66))
+    collector.add(goal(70))
+    assert collector.trials[0].velocity is not None
+
+
+def test_what_trials_use_is_never_forgotten(monkeypatch):
+    monkeypatch.setattr(module, 'KEPT', 20)
+    collector = collect(initial(1), action(2), *(goal(k / 10 + 2) for k in range(100)))
+    before = contents(collector.trials)
+    for k in range(300):
+        collector.add((goal if k % 2 else initial)(20 + k))
+    assert contents(collector.trials) == before
+    collector.add(action(320))
+    collector.add(goal(330))
+    assert [len(t.goals) for t in collector.trials] == [100, 1]
+    assert 'messages that are later' in refused(collector, action(150))
+
+
+def test_refusals_do_not_pile_up(monkeypatch):
+    monkeypatch.setattr(module, 'KEPT', 20)
+    collector = collect(initial(1), action(2), goal(5))
+    for k in range(100):
+        refused(collector, goal(10 + k, count=12))
+    assert len(collector.problems) <= 20
+    collector.add(goal(200))
+    assert len(collector.trials[0].goals) == 2
+
+
+# ---- any order of arrival
+
+@st.composite
+def sessions(draw):
+    """Draw messages at different stamps, many of which do not fit, in any order of arrival."""
+    found = []
+    for k in range(draw(st.integers(1, 14))):
+        at = 1 + 0.05 * k + draw(st.sampled_from([0.0, 0.0, 0.02]))
+        move = draw(st.sampled_from([0.0, 0.0, 0.0, 0.3]))
+        kind = draw(st.sampled_from('iag'))
+        if kind == 'a':
+            names = draw(st.sampled_from([('a',), ('b',), ('a', 'b'), ('b', 'a')]))
+            found.append(action(at, names=names, grips=(0, 9)[:len(names)], away=move,
+                                times=draw(st.sampled_from([(0.0, 0.04), (0.1, 0.12), (0.0,)]))))
+        else:
+            hands = draw(st.sampled_from([None, None, [0] * 11, [1, 2] + [0] * 9, [0, 1, 1] + [0] * 8]))
+            found.append((initial if kind == 'i' else goal)(at, move=move, hands=hands))
+            if draw(st.integers(0, 5)) == 0:
+                found[-1] = chain(found[-1].kind, at, count=12, move=move)
+    return found, draw(st.permutations(found)), Options(release=draw(st.booleans()))
+
+
+def feed(messages, options):
+    """Collect what can be; check that no refusal changes a trial, and that refusals name their message."""
+    collector = TrialCollector(options)
+    for message in messages:
+        before = contents(collector.trials)
+        try:
+            collector.add(message)
+        except InputError as error:
+            assert error.thing == str(message)
+            assert contents(collector.trials) == before
+    return collector
+
+
+@settings(deadline=None, max_examples=500)
+@given(session=sessions())
+def test_any_order_of_arrival_gives_the_same_trials(session):
+    ordered, arrived, options = session
+    one, other = feed(ordered, options), feed(arrived, options)
+    assert contents(one.trials) == contents(other.trials)
+    assert one.count == other.count == len(one.trials)
+    assert one.incomplete == other.incomplete
+    assert list(map(str, one.problems)) == list(map(str, other.problems))
+
+
+@settings(deadline=None, max_examples=100)
+@given(session=sessions(), again=st.data())
+def test_messages_sent_twice_change_nothing(session, again):
+    ordered, arrived, options = session
+    twice = again.draw(st.permutations([*ordered, *ordered]))
+    assert contents(feed(twice, options).trials) == contents(feed(arrived, options).trials)

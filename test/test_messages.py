@@ -1,0 +1,411 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Messages are read to the letter of the contract, and what is written reads back."""
+
+from dataclasses import replace
+import subprocess
+import sys
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from dlo_calibration import messages
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.calibration import CalibrationResult, Evaluation, ParameterEstimate
+from dlo_calibration.chain import Chain
+from dlo_calibration.errors import InputError
+from dlo_calibration.messages import ACTION, ActionMessage, GOAL, INITIAL, read
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.score import PointErrors
+from dlo_calibration.trial import Goal, Trial
+
+STAMP = 12_500_000_000
+SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
+
+
+def graph_types():
+    pytest.importorskip('sensor_msgs.msg', reason='the message classes of ROS 2 are not installed')
+    return messages.rclpy_types()
+
+
+SOURCES = {'rosbags': messages.bag_types, 'rclpy': graph_types}
+
+
+@pytest.fixture(params=SOURCES)
+def types(request):
+    return SOURCES[request.param]()
+
+
+def curve(count=21, length=1.0):
+    s = np.linspace(0, 1, count)
+    return np.stack([length * s, 0.1 * np.sin(3 * s), 0.05 * s**2], axis=1)
+
+
+def cloud(types, **changes):
+    message = messages.chain_cloud(types, Chain(curve()), STAMP, 'world')
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def field(types, name, datatype, offset, count=1):
+    return types.build('sensor_msgs/msg/PointField', name=name, datatype=datatype, offset=offset, count=count)
+
+
+def action(**changes):
+    return replace(ActionMessage(
+        STAMP, 'world', ('left_hand', 'right_hand'), np.array([0.0, 0.5, 2.000000001]),
+        np.arange(18.0).reshape(3, 2, 3) / 7, np.tile([0.0, 0.0, 0.6, 0.8], (3, 2, 1))), **changes)
+
+
+def refusal(kind, message):
+    """Return the refusal's text, which always names the message."""
+    with pytest.raises(InputError) as caught:
+        read(kind, message)
+    text = str(caught.value)
+    assert text.startswith(f'{kind} stamped 12.5 s: got ')
+    return text
+
+
+# ---- reading chains
+
+@pytest.mark.parametrize('single', [False, True])
+def test_written_chain_is_read_back(types, single):
+    chain = Chain(curve(), np.arange(21) % 3, np.arange(21) == 4)
+    found = read(GOAL, messages.chain_cloud(types, chain, STAMP, 'world', single=single))
+    assert (found.kind, found.stamp, found.frame_id) == (GOAL, STAMP, 'world')
+    expected = chain.points.astype(np.float32) if single else chain.points
+    np.testing.assert_array_equal(found.chain.points, expected)
+    np.testing.assert_array_equal(found.chain.hands, chain.hands)
+    np.testing.assert_array_equal(found.chain.features, chain.features)
+
+
+def test_bare_cloud_has_no_annotation(types):
+    message = cloud(types)
+    assert [one.name for one in message.fields] == ['x', 'y', 'z']
+    found = read(INITIAL, message)
+    assert found.chain.hands is None
+    assert not found.chain.features.any()
+
+
+def test_hand_field_of_zeros_tells_that_no_hand_holds(types):
+    message = messages.chain_cloud(types, Chain(curve(), np.zeros(21)), STAMP, 'world')
+    np.testing.assert_array_equal(read(GOAL, message).chain.hands, np.zeros(21))
+
+
+@st.composite
+def layouts(draw):
+    """Draw fields in any order with gaps, the point's size, byte order, and rows or a column with padding."""
+    names = ['x', 'y', 'z', *draw(st.sets(st.sampled_from(['hand', 'feature', 'rgb', 'intensity'])))]
+    fields, offset = [], draw(st.integers(0, 3))
+    for name in draw(st.permutations(names)):
+        datatype = draw(st.sampled_from(
+            [7, 8] if name in 'xyz' else [2] if name in ('hand', 'feature') else list(SIZES)))
+        fields.append((name, datatype, offset))
+        offset += SIZES[datatype] + draw(st.integers(0, 3))
+    return fields, offset + draw(st.integers(0, 5)), draw(st.booleans()), draw(st.booleans()), \
+        draw(st.integers(0, 7))
+
+
+@pytest.mark.parametrize('source', SOURCES)
+@settings(deadline=None, max_examples=150)
+@given(layout=layouts(), seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9))
+def test_any_layout_is_read(source, layout, seed, count):
+    types = SOURCES[source]()
+    fields, step, big, column, padding = layout
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3))
+    hands, features = rng.integers(0, 9, count), rng.integers(0, 2, count)
+    columns = {**dict(zip('xyz', points.T, strict=True)), 'hand': hands, 'feature': features}
+    row_step = step + padding if column else step * count + padding
+    octets = bytearray(rng.bytes((count if column else 1) * row_step))
+    codes = {2: 'u1', 7: 'f4', 8: 'f8'}
+    expected = {}
+    for name, datatype, offset in fields:
+        if name in columns:
+            dtype = np.dtype('<>'[big] + codes[datatype])
+            values = columns[name].astype(dtype)
+            expected[name] = values.astype(float)
+            for k in range(count):
+                at = k * (row_step if column else step) + offset
+                octets[at:at + dtype.itemsize] = values[k:k + 1].tobytes()
+    message = cloud(
+        types, fields=[field(types, *one) for one in fields], is_bigendian=big, point_step=step,
+        row_step=row_step, data=types.octets(bytes(octets)), height=count if column else 1,
+        width=1 if column else count)
+    chain = read(INITIAL, message).chain
+    np.testing.assert_array_equal(chain.points, np.stack([expected[name] for name in 'xyz'], axis=1))
+    if 'hand' in expected:
+        np.testing.assert_array_equal(chain.hands, expected['hand'])
+    else:
+        assert chain.hands is None
+    np.testing.assert_array_equal(chain.features, expected.get('feature', np.zeros(count)) != 0)
+
+
+def test_last_row_needs_no_padding(types):
+    full = cloud(types)
+    padded = b''.join(bytes(full.data[k:k + 24]) + b'pad' for k in range(0, len(full.data), 24))[:-3]
+    found = read(INITIAL, cloud(types, height=21, width=1, row_step=27, data=types.octets(padded)))
+    np.testing.assert_array_equal(found.chain.points, curve())
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'width': 22}, '504 bytes of data, expected 528'),
+    ({'height': 3, 'width': 7}, 'height 3 and width 7'),
+    ({'height': 0, 'width': 0}, 'height 0 and width 0'),
+    ({'width': 0}, '0 point(s), expected at least 3'),
+    ({'width': 2}, '2 point(s), expected at least 3'),
+    ({'point_step': 20}, "field 'z' at offset 16 of points of 20 bytes"),
+    ({'point_step': 0}, 'of points of 0 bytes'),
+    ({'height': 21, 'width': 1, 'row_step': 0}, 'row_step 0'),
+])
+def test_impossible_shape_is_refused(types, changes, words):
+    assert words in refusal(GOAL, cloud(types, **changes))
+
+
+def test_too_many_points_are_refused_before_their_bytes_are_looked_at(types):
+    assert '4000000000 points, expected at most' in refusal(INITIAL, cloud(types, width=4_000_000_000))
+
+
+@pytest.mark.parametrize(('fields', 'words'), [
+    ([('x', 7, 0), ('y', 7, 4)], 'no field z (fields: x y), expected fields x y z'),
+    ([], 'no field x y z (fields: none)'),
+    ([('x', 5, 0), ('y', 7, 4), ('z', 7, 8)], "field 'x' int32 (count 1), expected float32 or float64"),
+    ([('x', 99, 0), ('y', 7, 4), ('z', 7, 8)], "field 'x' of datatype 99"),
+    ([('x', 7, 0, 3), ('y', 7, 4), ('z', 7, 8)], "field 'x' float32 (count 3)"),
+    ([('x', 7, 0), ('y', 7, 4), ('z', 7, 8), ('hand', 7, 12)],
+     "field 'hand' float32 (count 1), expected uint8"),
+    ([('x', 7, 0), ('y', 7, 4), ('z', 7, 8), ('feature', 1, 12)], "field 'feature' int8"),
+    ([('x', 7, 0), ('y', 7, 4), ('z', 7, 8), ('x', 7, 12)], "two fields 'x'"),
+])
+def test_unusable_field_is_refused(types, fields, words):
+    assert words in refusal(GOAL, cloud(types, fields=[field(types, *one) for one in fields]))
+
+
+def test_hand_beyond_eight_is_refused(types):
+    message = messages.chain_cloud(types, Chain(curve(), np.full(21, 9)), STAMP, 'world')
+    assert 'hand 9, expected 0 for none, or 1 to 8' in refusal(INITIAL, message)
+
+
+@pytest.mark.parametrize(('index', 'value', 'words'), [
+    (5, np.nan, 'NaN or infinity in point(s) 5'),
+    (6, np.inf, 'NaN or infinity in point(s) 6'),
+    (8, curve()[7], 'coincident neighbours after point(s) 7'),
+    (9, 1e30, 'a coordinate of 1e+30 m in point 9'),
+])
+def test_unusable_points_are_refused(types, index, value, words):
+    points = curve()
+    points[index] = value
+    assert words in refusal(GOAL, cloud(types, data=types.octets(points.tobytes())))
+
+
+@pytest.mark.parametrize('kind', [INITIAL, ACTION, GOAL])
+@pytest.mark.parametrize(('seconds', 'words'), [
+    (0, 'stamped 0 s: got a stamp of zero'), (-3, 'stamped -3 s: got a negative stamp')])
+def test_stamp_must_be_a_time(types, kind, seconds, words):
+    message = messages.action_trajectory(types, action()) if kind == ACTION else cloud(types)
+    message.header.stamp.sec, message.header.stamp.nanosec = seconds, 0
+    with pytest.raises(InputError, match=f'{kind} {words}'):
+        read(kind, message)
+
+
+# ---- reading actions
+
+def test_written_action_is_read_back(types):
+    found = read(ACTION, messages.action_trajectory(types, action()))
+    assert (found.kind, found.stamp, found.frame_id) == (ACTION, STAMP, 'world')
+    assert found.names == ('left_hand', 'right_hand')
+    for name in ('times', 'positions', 'orientations'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(action(), name))
+
+
+def test_velocities_of_an_action_are_ignored(types):
+    message = messages.action_trajectory(types, action())
+    zero = types.build('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+    message.points[0].velocities = [types.build('geometry_msgs/msg/Twist', linear=zero, angular=zero)]
+    np.testing.assert_array_equal(read(ACTION, message).positions, action().positions)
+
+
+def rename(message, names):
+    message.joint_names = names
+
+
+def set_point(message, k, **changes):
+    for name, value in changes.items():
+        setattr(message.points[k], name, value)
+
+
+def set_time(message, k, seconds):
+    message.points[k].time_from_start.sec = seconds
+
+
+def set_transform(message, part, **changes):
+    for name, value in changes.items():
+        setattr(getattr(message.points[1].transforms[1], part), name, value)
+
+
+@pytest.mark.parametrize(('spoil', 'words'), [
+    (lambda m: rename(m, []), '2 transforms in trajectory point 0, expected one for each of the 0'),
+    (lambda m: rename(m, ['a', 'a']), "joint_names ['a', 'a'], expected a different name for each hand"),
+    (lambda m: rename(m, ['a', '']), "joint_names ['a', '']"),
+    (lambda m: set_point(m, 1, transforms=m.points[1].transforms[:1]), '1 transforms in trajectory point 1'),
+    (lambda m: setattr(m, 'points', []), 'no trajectory points, expected at least one'),
+    (lambda m: set_time(m, 1, 2), 'time_from_start 2 s of trajectory point 2 after 2.5 s'),
+    (lambda m: set_time(m, 0, -1), 'time_from_start from -1 to 2 s'),
+    (lambda m: set_time(m, 2, 1_700_000_000), 'time_from_start from 0 to 1.7e+09 s'),
+    (lambda m: set_transform(m, 'rotation', x=0.0, y=0.0, z=0.0, w=0.0),
+     'a quaternion of length 0 for right_hand in trajectory point 1'),
+    (lambda m: set_transform(m, 'rotation', x=0.0, y=0.0, z=0.0, w=0.1), 'a quaternion of length 0.1'),
+    (lambda m: set_transform(m, 'rotation', w=np.nan), 'NaN or infinity in rotation of trajectory point 1'),
+    (lambda m: set_transform(m, 'translation', y=-1e300), 'a coordinate of -1e+300 m in trajectory point 1'),
+    (lambda m: set_transform(m, 'translation', z=np.inf),
+     'NaN or infinity in translation of trajectory point 1'),
+])
+def test_unusable_action_is_refused(types, spoil, words):
+    message = messages.action_trajectory(types, action())
+    spoil(message)
+    assert words in refusal(ACTION, message)
+
+
+def test_action_of_nine_hands_is_refused(types):
+    nine = messages.action_trajectory(types, action(
+        names=tuple('abcdefgh'), times=[0.0], positions=np.zeros((1, 8, 3)),
+        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (1, 8, 1))))
+    assert len(read(ACTION, nine).names) == 8
+    nine.joint_names = list('abcdefghi')
+    nine.points[0].transforms = [*nine.points[0].transforms, nine.points[0].transforms[0]]
+    assert '9 joint_names, expected 1 to 8' in refusal(ACTION, nine)
+
+
+# ---- writing diagnostics
+
+def found_result(**changes):
+    estimates = {
+        'flexibility': ParameterEstimate('flexibility', 100 / 3, 0.1 + 0.2, 30.0, 36.5, 1e-3 / 7, 1e-5, 2e-3,
+                                         'N m^2 per N/m', True),
+        'friction': ParameterEstimate('friction', 50.0, 28.9, 0.0, 100.0, 0.14, 0.01, 2.0, '1', False)}
+    best = Evaluation(1, np.array([1 / 3, 0.5]), {'flexibility': 100 / 3, 'friction': 50.0}, (40.5, 20.25),
+                      PointErrors(0.002, 0.003, 0.01, 0.001), np.zeros(3))
+    chain = Chain([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    trial = Trial('trial 1', chain, (Action((Hand('left_hand', (0,), [0.0], [[0, 0, 0]]),)),),
+                  (Goal(chain, 1.0),))
+    return replace(CalibrationResult(
+        ParameterSpace(('flexibility', 'friction')), estimates, best, (trial, trial), (), (best, best, best),
+        9.1, 'random', 'bullet', 'budget of 3 evaluations spent', 7, ('one', 'two')), **changes)
+
+
+def by_name(message):
+    return {one.name: (one, {pair.key: pair.value for pair in one.values}) for one in message.status}
+
+
+def test_result_tells_every_parameter_exactly(types):
+    found = found_result()
+    message = messages.result(types, found, STAMP)
+    values = messages.result_values(message)
+    assert list(values) == ['flexibility', 'friction']
+    for name, estimate in found.parameters.items():
+        assert list(values[name]) == [
+            'value', 'std', 'lower', 'upper', 'unit', 'physical_value', 'physical_lower', 'physical_upper',
+            'physical_unit', 'identifiable']
+        for key, value in values[name].items():
+            assert value == ('0..100' if key == 'unit' else getattr(estimate, key))
+    levels = {name: one.level for name, (one, _) in by_name(message).items()}
+    assert levels['flexibility'] == types.level(0)
+    assert levels['friction'] == types.level(1)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
+
+
+def test_result_tells_the_whole(types):
+    one, values = by_name(messages.result(types, found_result(), STAMP))['calibration']
+    assert values.pop('seconds') == '9.1'
+    assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
+    assert float(values.pop('error_percent_of_length')) == pytest.approx(0.1)
+    for key, millimetres in (('mean', 2), ('rms', 3), ('max', 10), ('mean_abs', 1)):
+        assert float(values.pop(f'{key}_error_mm')) == pytest.approx(millimetres)
+    assert values == {
+        'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
+        'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent',
+        'warnings': 'one; two'}
+    assert one.level == types.level(1)
+    one, values = by_name(messages.result(types, found_result(warnings=(), seed=None), STAMP))['calibration']
+    assert one.level == types.level(0)
+    assert (values['seed'], values['warnings']) == ('', '')
+
+
+def test_progress_tells_the_best_so_far_and_what_is_left(types):
+    best = Evaluation(0, np.array([0.25]), {'friction': 25.0}, (12.0,))
+    failed = Evaluation(4, np.array([0.5]), {'friction': 50.0}, failure='diverged')
+    one, values = by_name(messages.progress(
+        types, stamp=STAMP, evaluation=failed, best=best, evaluations=150, simulations_per_second=31.5,
+        seconds_left=4.6))['progress']
+    assert values == {'evaluation': '5', 'evaluations': '150', 'score': 'inf', 'best_score': '12.0',
+                      'best_friction': '25.0', 'simulations_per_second': '31.5', 'seconds_left': '4.6',
+                      'failure': 'diverged'}
+    assert one.message == 'evaluation 5 of 150, best score 12.0, 5 s left'
+    assert one.level == types.level(1)
+
+
+@pytest.mark.parametrize(('state', 'level'), [
+    ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
+def test_status_tells_state_trials_and_refusal(types, state, level):
+    one, values = by_name(messages.status(
+        types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why'
+    ))['status']
+    assert values == {'state': state, 'trials': '3', 'last_refusal': 'too few', 'incomplete': 'a goal',
+                      'detail': 'why'}
+    assert one.message == f'{state}: why'
+    assert one.level == types.level(level)
+
+
+def test_status_knows_four_states(types):
+    with pytest.raises(ValueError, match='sleeping'):
+        messages.status(types, stamp=STAMP, state='sleeping', trials=0)
+
+
+def test_written_messages_cross_the_wire(types):
+    """All that is written can be serialised and comes back as it was."""
+    if isinstance(types.octets(b''), np.ndarray):
+        from rosbags.typesys import get_typestore, Stores
+        store = get_typestore(Stores.ROS2_JAZZY)
+
+        def travel(message):
+            name = message.__msgtype__
+            return store.deserialize_cdr(store.serialize_cdr(message, name), name)
+    else:
+        serialization = pytest.importorskip('rclpy.serialization', reason='ROS 2 is not installed')
+
+        def travel(message):
+            return serialization.deserialize_message(serialization.serialize_message(message), type(message))
+
+    chain = Chain(curve(), np.arange(21) % 2, np.arange(21) == 4)
+    found = read(INITIAL, travel(messages.chain_cloud(types, chain, STAMP, 'world')))
+    np.testing.assert_array_equal(found.chain.points, chain.points)
+    np.testing.assert_array_equal(found.chain.hands, chain.hands)
+    np.testing.assert_array_equal(
+        read(ACTION, travel(messages.action_trajectory(types, action()))).positions, action().positions)
+    values = messages.result_values(travel(messages.result(types, found_result(), STAMP)))
+    assert values['flexibility']['value'] == 100 / 3
+    report = travel(messages.status(types, stamp=STAMP, state='failed', trials=0, detail='why'))
+    assert report.status[0].level == types.level(2)
+
+
+def test_module_loads_no_message_package():
+    code = ('import sys, dlo_calibration.messages\n'
+            'print(sorted({"rclpy", "rosbags", "sensor_msgs"} & set(sys.modules)))')
+    printed = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
+    assert printed == '[]\n'
