@@ -1,0 +1,256 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Recording: a session is written into a new rosbag2 folder as it happens.
+
+One MCAP file as `ros2 bag record` writes it (profile ``ros2``, schema encoding
+``ros2msg``, CDR bytes), with a ``metadata.yaml`` beside it, so `ros2 bag play`,
+Foxglove and the library rosbags read it.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from io import StringIO
+import json
+from pathlib import Path
+from typing import Any, BinaryIO, cast, Mapping
+
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
+from ruamel.yaml import YAML
+
+from dlo_calibration.errors import DloCalibrationError
+
+OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
+METADATA_FILE = 'metadata.yaml'
+METADATA_KEY = 'rosbag2_bagfile_information'
+ROSBAG2_VERSION = 9  # of metadata.yaml: what Jazzy writes, and the last that rosbags reads
+NO_TIME = 2**63 - 1  # rosbag2's starting time of a bag without messages
+FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # rmw's infinite duration
+LATCHED = ('result', 'status', 'dlo_description', 'markers')  # topics whose last message stays
+
+
+class RecordingError(DloCalibrationError):
+    """A session that cannot be written further (disk full, no permission, ...)."""
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """Return the message definitions of Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+class SessionWriter:
+    """
+    Writes a session into a new rosbag2 folder.
+
+    Nothing is ever overwritten: where `path` exists, the folder is called
+    ``path_2``, ``path_3``, ...  Each message is on its way to the disk when
+    `write` returns, so a killed process loses none that it had written.
+
+    :param path: the folder to make, or, ending in ``.mcap``, a single file
+        without folder and metadata.yaml; parents are made too.
+    :param options: as for `write_options`; None: written later or never.
+    :raises RecordingError: here and in every method, where the disk refuses.
+        Nothing is written after the first such error.
+    """
+
+    def __init__(self, path: str | Path, options: Mapping[str, Any] | None = None) -> None:
+        self._failure = ''
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts: dict[tuple[str, str], int] = {}
+        self._first, self._last = NO_TIME, 0
+        self._closed = False
+        try:
+            self.path, self.file, self._stream = _create(Path(path))
+        except OSError as error:
+            raise RecordingError(f'session {path}: cannot be written: {error}') from error
+        self._writer = cast(Any, Writer(self._stream, compression=CompressionType.ZSTD))  # partly untyped
+        with self._disk():
+            self._writer.start(profile='ros2', library='dlo_calibration')
+            self._writer.flush()
+            self._write_metadata_file()
+        if options is not None:
+            self.write_options(options)
+
+    def write(self, topic: str, message_type: str, data: bytes, log_time: int, flush: bool = True) -> None:
+        """
+        Record one message.
+
+        :param topic: its full name, e.g. ``/calibrator/action``.
+        :param message_type: ``package/msg/Type``, one of Jazzy's common_interfaces.
+        :param data: CDR bytes.
+        :param log_time: [ns], greater than 0.
+        :param flush: False where more messages of the same group follow at once;
+            the group then costs less space, and reaches the disk with its last.
+        """
+        key = topic, message_type
+        with self._disk():
+            new = key not in self._channels
+            if new:
+                self._add_channel(topic, message_type)
+            self._writer.add_message(self._channels[key], log_time, data, log_time, self._counts[key])
+            self._counts[key] += 1
+            self._first, self._last = min(self._first, log_time), max(self._last, log_time)
+            if flush:
+                self._writer.flush()
+            if new:
+                self._write_metadata_file()
+
+    def write_options(self, options: Mapping[str, Any]) -> None:
+        """Record the options in force, a flat mapping, so that a replay uses the same."""
+        self._write_ours('options', json.dumps(dict(options), sort_keys=True))
+
+    def write_mark(self, mark: str) -> None:
+        """
+        Record that a calibration of what was collected began, or that the trials were forgotten.
+
+        :param mark: ``start`` or ``reset``, the services that change which
+            messages a result stands on.
+        """
+        self._write_ours('mark', mark)
+
+    def close(self) -> None:
+        """Write the index and the final metadata.yaml; closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._failure:
+            return
+        with self._disk():
+            self._writer.flush()
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': _yaml(self._metadata())})
+            self._writer.finish()
+            self._stream.close()
+            self._write_metadata_file()
+
+    def __enter__(self) -> SessionWriter:
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _disk(self) -> _Disk:
+        if self._failure:
+            raise RecordingError(self._failure)
+        return _Disk(self)
+
+    def _fail(self, error: OSError | ValueError) -> RecordingError:
+        self._failure = f'session {self.path}: cannot be written: {error}; recording ends here'
+        try:
+            self._stream.close()
+        except OSError:
+            pass  # it was reported by what failed first
+        return RecordingError(self._failure)
+
+    def _write_ours(self, key: str, text: str) -> None:
+        with self._disk():
+            self._writer.flush()
+            self._writer.add_metadata(OUR_RECORD, {key: text})
+            self._writer.flush()
+
+    def _add_channel(self, topic: str, message_type: str) -> None:
+        if message_type not in self._schemas:
+            definition = typestore().generate_msgdef(message_type, ros_version=2)[0]
+            self._schemas[message_type] = self._writer.register_schema(
+                message_type, 'ros2msg', definition.encode())
+        self._channels[topic, message_type] = self._writer.register_channel(
+            topic, 'cdr', self._schemas[message_type],
+            {'offered_qos_profiles': _yaml([_qos(topic)]),
+             'topic_type_hash': typestore().hash_rihs01(message_type)})
+        self._counts[topic, message_type] = 0
+
+    def _metadata(self) -> dict[str, Any]:
+        """Describe the bag as rosbag2_storage's struct BagMetadata, version 9, does."""
+        count = sum(self._counts.values())
+        times: dict[str, Any] = {
+            'duration': {'nanoseconds': self._last - self._first if count else 0},
+            'starting_time': {'nanoseconds_since_epoch': self._first}}
+        return {
+            'version': ROSBAG2_VERSION, 'storage_identifier': 'mcap', **times, 'message_count': count,
+            'topics_with_message_count': [
+                {'topic_metadata': {
+                    'name': topic, 'type': message_type, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': [_qos(topic)],
+                    'type_description_hash': typestore().hash_rihs01(message_type)},
+                 'message_count': self._counts[topic, message_type]}
+                for topic, message_type in self._channels],
+            'compression_format': '', 'compression_mode': '',
+            'relative_file_paths': [self.file.name],
+            'files': [{'path': self.file.name, **times, 'message_count': count}],
+            'custom_data': {}, 'ros_distro': 'jazzy'}
+
+    def _write_metadata_file(self) -> None:
+        """Write metadata.yaml, whole or not at all."""
+        if self.file == self.path:
+            return
+        whole = self.path / f'{METADATA_FILE}.new'
+        whole.write_text(_yaml({METADATA_KEY: self._metadata()}) + '\n', encoding='utf-8')
+        whole.replace(self.path / METADATA_FILE)
+
+
+class _Disk:
+    """Turns an error of the disk into the writer's one exception."""
+
+    def __init__(self, writer: SessionWriter) -> None:
+        self._writer = writer
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, (OSError, ValueError)):  # ValueError: the stream is closed
+            raise self._writer._fail(error) from error
+
+
+def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
+    """Create what is asked for under a name that is not taken; return it, its MCAP file, and that open."""
+    for number in range(1, 100000):
+        suffix = path.suffix if path.suffix == '.mcap' else ''
+        free = path if number == 1 else path.with_name(f'{path.name.removesuffix(suffix)}_{number}{suffix}')
+        free.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            if suffix:
+                return free, free, free.open('xb')
+            free.mkdir()
+        except FileExistsError:
+            continue
+        file = free / f'{free.name}_0.mcap'
+        return free, file, file.open('xb')
+    raise OSError(f'{path} and its numbered names all exist')
+
+
+def _qos(topic: str) -> dict[str, Any]:
+    latched = topic.rsplit('/', 1)[-1] in LATCHED
+    return {'history': 'keep_last', 'depth': 1 if latched else 10, 'reliability': 'reliable',
+            'durability': 'transient_local' if latched else 'volatile',
+            'deadline': dict(FOREVER), 'lifespan': dict(FOREVER), 'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(FOREVER), 'avoid_ros_namespace_conventions': False}
+
+
+def _yaml(value: Any) -> str:
+    yaml = YAML(typ='safe', pure=True)
+    yaml.default_flow_style = False
+    yaml.width = 4096
+    yaml.representer.ignore_aliases = lambda _: True
+    text = StringIO()
+    yaml.dump(value, text)
+    return text.getvalue().strip()
