@@ -1,0 +1,63 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The executable `calibrator`: listens to signals first, and loads ROS only then.
+
+So SIGINT and SIGTERM end it cleanly while it is still starting, too.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Sequence
+
+from dlo_calibration.signals import StopFlag
+
+USAGE = """usage: calibrator [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
+
+Calibrates a deformable linear object from messages; ends on SIGINT or SIGTERM.
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Run the node until a signal arrives.
+
+    :param args: command line without the program's name; None: that of the process.
+    :returns: exit code: 0, or 2 for what cannot be used, after one line on stderr.
+    """
+    args = list(sys.argv[1:] if args is None else args)
+    if args in (['-h'], ['--help']):
+        sys.stdout.write(USAGE)
+        return 0
+    stop = StopFlag()
+    stop.listen()
+    try:
+        from dlo_calibration.node import spin
+
+        return spin(args, stop)
+    except ImportError as error:
+        if stop():  # what is half imported when a signal arrives may fail in any way
+            return 0
+        sys.stderr.write(f'calibrator: {error}; source a ROS 2 Jazzy installation, or install the '
+                         "libraries with pip install 'dlo_calibration[ros]'\n")
+        return 2
+    finally:
+        stop.ignore()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,229 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The demo: the real node, a sample session sent to it over the graph, a result and a picture.
+
+`python -m dlo_calibration.demo [--output DIR]`; this process stands for the robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any, Callable, Iterator, Sequence
+
+from dlo_calibration import terminal
+from dlo_calibration.cli import document, validated
+from dlo_calibration.config import Options
+from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.messages import INPUT_TYPES, OUTPUT_TYPES, rclpy_types
+from dlo_calibration.picture import session_picture
+from dlo_calibration.session import read_session, Session, session_trials
+from dlo_calibration.signals import StopFlag
+from dlo_calibration.xml import read_result
+
+NODE = '/calibrator'
+EVALUATIONS = 40
+LAST_DOMAIN = 101  # above it, the ports of a ROS domain may be anybody's
+PATIENCE = 60.0  # s without any sign of life from the node
+PICTURE, LOG = 'demo.png', 'calibrator.log'
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; return 0, or 1 with one line on stderr where something did not work."""
+    parser = argparse.ArgumentParser(prog='demo', description='Calibrate a sample with the real node.')
+    parser.add_argument('--output', type=Path, default=Path('demo_output'), help='folder to write to')
+    parser.add_argument('--sample', type=Path, help='session to send; default: object1 of msg_samples')
+    parser.add_argument('--evaluations', type=int, default=EVALUATIONS)
+    chosen = parser.parse_args(args)
+    stop = StopFlag()
+    stop.listen()
+    try:
+        _demo(chosen.output, chosen.sample or samples() / 'object1', chosen.evaluations, stop)
+    except DloCalibrationError as error:
+        sys.stderr.write(f'demo: {error}\n')
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def samples() -> Path:
+    """Return the folder of the sample sessions: of the sources, or where they are installed."""
+    beside = Path(__file__).resolve().parents[1] / 'msg_samples'
+    shared = Path('share') / 'dlo_calibration' / 'msg_samples'
+    prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):
+        if folder.is_dir():
+            return folder
+    raise InputError('demo', 'no folder msg_samples', f'{beside} or $AMENT_PREFIX_PATH/{shared}',
+                     'install the package with its samples, or name a session with --sample')
+
+
+def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]) -> None:
+    session = read_session(sample)
+    output.mkdir(parents=True, exist_ok=True)
+    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % LAST_DOMAIN)
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.environ.setdefault('ROS_LOG_DIR', str(output.resolve() / 'ros_log'))
+    before = set(output.glob('dlo_session_*'))
+    options = {**(session.options or {}), 'evaluations': evaluations,
+               'output_directory': str(output.resolve())}
+    out = terminal.console(sys.stdout)
+    with _node(options, output / LOG) as child, _robot(child, output / LOG, stop) as robot:
+        out.print(f'sending {sample.name} to the node {NODE} ...')
+        robot.send(session)
+        expected = len(session_trials(session, Options.of({**Options().flat(), **options}))[0])
+        robot.wait(lambda: robot.value('status', 'trials') == str(expected), f'{expected} trials in ~/status')
+        out.print(f'the node has {expected} trials; calling ~/start')
+        robot.start()
+        with terminal.SearchBar(evaluations, sys.stderr) as bar:
+            robot.wait(lambda: _show(robot, bar), 'a result')
+    folder, = set(output.glob('dlo_session_*')) - before
+    file = read_result(folder / 'result.xml')
+    used = Options.of(file.options)
+    result = validated(file, session_trials(read_session(folder), used)[0], used)
+    session_picture(result.trials, result.chains, output / PICTURE)
+    out.print(terminal.parameter_table(document(result)['parameters']))
+    out.print(terminal.facts_table('fit', [
+        *terminal.error_facts(result)[:4], ('evaluations', f'{file.evaluations} in {file.seconds:.1f} s'),
+        ('search', f'{file.search}, seed {file.seed}'), ('engine', file.engine),
+        ('ended', file.stop_reason)]))
+    for sentence in terminal.unidentifiable_words(result):
+        out.print(sentence)
+    out.print(f'session and result.xml: {folder}', soft_wrap=True)
+    out.print(f'simulated chains on the measured ones: {output / PICTURE}', soft_wrap=True)
+
+
+def _show(robot: Any, bar: terminal.SearchBar) -> bool:
+    """Move the progress bar; return whether the result is there."""
+    if robot.value('status', 'state') == 'failed':
+        raise DloCalibrationError(f'the node says: {robot.value("status", "detail")}')
+    if robot.value('progress', 'evaluation'):
+        bar.move(int(robot.value('progress', 'evaluation')), float(robot.value('progress', 'best_score')))
+    return 'result' in robot.heard
+
+
+@contextmanager
+def _node(options: dict[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Start the node as a process of its own, and end it as Ctrl-C would."""
+    command = [sys.executable, '-m', 'dlo_calibration.calibrator', '--ros-args']
+    for name, value in options.items():
+        command += ['-p', f'{name}:={json.dumps(value)}']  # JSON is YAML, which ROS expects
+    with log.open('wb') as stream:
+        child = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
+        try:
+            yield child
+            child.send_signal(signal.SIGINT)
+            code = child.wait(PATIENCE)
+            if code:
+                raise DloCalibrationError(f'the node ended with exit code {code}; see {log}')
+        finally:
+            if child.poll() is None:
+                child.terminate()
+                try:
+                    child.wait(PATIENCE)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                    child.wait()
+
+
+@contextmanager
+def _robot(child: subprocess.Popen[bytes], log: Path, stop: Callable[[], bool]) -> Iterator[_Robot]:
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        raise DloCalibrationError(
+            f"{error}; source a ROS 2 Jazzy installation, or pip install 'dlo_calibration[ros]'") from error
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node('robot')
+        yield _Robot(node, child, log, stop)
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+class _Robot:
+    """What robot software does: send, call, listen."""
+
+    def __init__(self, node: Any, child: subprocess.Popen[bytes], log: Path,
+                 stop: Callable[[], bool]) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_srvs.srv import Trigger
+
+        self.heard: dict[str, Any] = {}
+        self._node, self._child, self._log, self._stop = node, child, log, stop
+        self._request = Trigger.Request()
+        find = rclpy_types().find
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for name, kind in OUTPUT_TYPES.items():
+            node.create_subscription(
+                find(kind), f'{NODE}/{name}', lambda message, name=name: self.heard.update({name: message}),
+                QoSProfile(depth=10) if name == 'progress' else latched)
+        self._publishers = {name: node.create_publisher(find(kind), f'{NODE}/{name}', QoSProfile(depth=1000))
+                            for name, kind in INPUT_TYPES.items()}
+        self._client = node.create_client(Trigger, f'{NODE}/start')
+
+    def value(self, topic: str, key: str) -> str:
+        """Return a value of the first status in the last message of a topic; empty where there is none."""
+        if topic not in self.heard:
+            return ''
+        return str(next((pair.value for pair in self.heard[topic].status[0].values if pair.key == key), ''))
+
+    def wait(self, ready: Callable[[], bool], what: str) -> None:
+        """Listen until `ready`; give up where nothing is heard for long."""
+        import rclpy
+
+        last, quiet_since = dict(self.heard), time.monotonic()
+        while not ready():
+            if self._stop():
+                raise KeyboardInterrupt
+            if self._child.poll() is not None:
+                raise DloCalibrationError(f'the node ended by itself; see {self._log}')
+            rclpy.spin_once(self._node, timeout_sec=0.05)
+            if any(last.get(name) is not message for name, message in self.heard.items()):
+                last, quiet_since = dict(self.heard), time.monotonic()
+            if time.monotonic() - quiet_since > PATIENCE:
+                raise DloCalibrationError(f'waited {PATIENCE:.0f} s for {what}; see {self._log}')
+
+    def send(self, session: Session) -> None:
+        """Publish the input messages of a session, byte by byte as they were recorded."""
+        self.wait(lambda: all(p.get_subscription_count() for p in self._publishers.values())
+                  and self._client.service_is_ready() and 'status' in self.heard, 'the node')
+        for record in session.records:
+            if INPUT_TYPES.get(record.name) == record.type:
+                self._publishers[record.name].publish(record.data)
+
+    def start(self) -> None:
+        """Call ~/start."""
+        future = self._client.call_async(self._request)
+        self.wait(future.done, 'the answer of ~/start')
+        answer = future.result()
+        if not answer.success:
+            raise DloCalibrationError(f'the node says: {answer.message}')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

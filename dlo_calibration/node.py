@@ -1,0 +1,452 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The node: topics, services and parameters around a collector and a worker.
+
+Nothing is computed here.  Whatever goes wrong ends in the log and in ``~/status``,
+and the node stays.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import time
+from typing import Any, Callable, Mapping, Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from dlo_calibration import messages
+from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.collector import TrialCollector
+from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.recorder import Recorder
+from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
+
+DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains
+#: topic -> class, quality of service
+INPUTS = {
+    INITIAL: (PointCloud2, QoSProfile(depth=DEPTH)),
+    ACTION: (MultiDOFJointTrajectory, QoSProfile(depth=DEPTH)),
+    GOAL: (PointCloud2, QoSProfile(depth=DEPTH)),
+}
+BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+OUTPUTS = {
+    'progress': (DiagnosticArray, QoSProfile(depth=10)),
+    'result': (DiagnosticArray, LATCHED),
+    'status': (DiagnosticArray, LATCHED),
+}
+ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')  # declared by rclpy
+
+#: What a bad command line raises; nothing public has them.
+ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
+
+TICK = 0.05  # s between two looks at the worker
+PROGRESS_PERIOD = 0.1  # s between two progress messages, at least
+QUIET = 0.5  # s without action or goal chain, until a last trial counts as complete for start_after_trials
+DEFECT = 'this is a defect of dlo_calibration, please report it'
+PATIENCE = 10.0  # s that the end waits for the worker
+
+DECLARED: Mapping[str, Declaration] = {declaration.name: declaration for declaration in declarations()}
+
+
+def spin(args: Sequence[str], should_stop: Callable[[], bool],
+         make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
+    """
+    Run the node until `should_stop`; handles no signal itself.
+
+    :param args: command line without the program's name.
+    :returns: exit code: 0, or 2 for what cannot be used, after one line on stderr.
+    """
+    node, executor = None, None
+    try:
+        strange = remove_ros_args(['calibrator', *args])[1:]
+        if strange:
+            raise InputError('command line', ' '.join(strange), 'only --ros-args ...',
+                             'set a parameter with --ros-args -p NAME:=VALUE')
+        if should_stop():
+            return 0
+        rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
+        node = CalibratorNode(make_simulator)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not should_stop() and rclpy.ok():
+            executor.spin_once(timeout_sec=TICK)
+    except ExternalShutdownException:
+        pass
+    except (InputError, *ARGUMENT_ERRORS) as error:
+        sys.stderr.write(f'calibrator: {" ".join(str(error).split())}\n')
+        return 2
+    finally:
+        if executor is not None:
+            executor.shutdown(timeout_sec=0)
+        if node is not None:
+            node.close()
+        rclpy.try_shutdown()
+    return 0
+
+
+class CalibratorNode(Node):
+    """
+    The node `calibrator`.
+
+    :param make_simulator: builds the engine, in the worker's thread.
+    :param arguments: of `rclpy.node.Node`, e.g. `parameter_overrides`.
+    :raises InputError: for a parameter with an unknown name or a bad value.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
+        super().__init__('calibrator', automatically_declare_parameters_from_overrides=True, **arguments)
+        try:
+            self._declare()
+        except BaseException:
+            self.destroy_node()
+            raise
+        self._types = messages.rclpy_types()
+        self._collector = TrialCollector(self.options())
+        self._collected_with = self.options()
+        self._worker = Worker(make_simulator)
+        self._recorder = Recorder(self._fail_to_record)
+        self._calibrating: Options | None = None  # options of the calibration under way
+        self._progress = Progress(0, 0)
+        self._progress_sent = 0.0
+        self._forget()
+        self._deaf: set[str] = set()
+        self._closed = False
+        self._outputs = {name: self.create_publisher(kind, f'~/{name}', qos)
+                         for name, (kind, qos) in OUTPUTS.items()}
+        self._begin_session()
+        self._report()
+        self._inputs = {name: self._subscribe(name, qos) for name, (_, qos) in INPUTS.items()}
+        for name, act in (('start', self._start), ('stop', self._stop), ('reset', self._reset)):
+            self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, act))
+        # Steady: with use_sim_time and no /clock, a timer of the node's own clock would never fire.
+        self.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info('collecting trials; call ~/start to calibrate')
+
+    def close(self) -> None:
+        """End the worker and the session, and destroy the node; closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._worker.stop()
+        try:
+            if not self._worker.join(PATIENCE):
+                self._warn('the simulation under way does not end; it is left behind')
+            self._take_events()
+        except (InvalidHandle, RuntimeError) as error:  # the context was shut down by somebody else
+            self.get_logger().debug(repr(error))
+        finally:
+            self._recorder.end()
+            self.destroy_node()
+
+    # Parameters
+
+    def options(self) -> Options:
+        """Return the options in force."""
+        return Options.of({name: _plain(self.get_parameter(name).value) for name in DECLARED})
+
+    def _declare(self) -> None:
+        """Declare the parameters; what the user gave was declared by rclpy already, as it came."""
+        given = {name: _plain(one.value) for name, one in self.get_parameters_by_prefix('').items()
+                 if not name.startswith(ROS_PARAMETERS)}
+        chosen = _checked(given)
+        for name in given:
+            self.undeclare_parameter(name)
+        for name, value in chosen.flat().items():
+            self.declare_parameter(name, value, _descriptor(DECLARED[name]), ignore_override=True)
+        self.add_pre_set_parameters_callback(_as_declared)
+        self.add_on_set_parameters_callback(self._check_parameters)
+
+    def _check_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        changed = {p.name: _plain(p.value) for p in parameters if p.name in DECLARED}
+        try:
+            _checked({**self.options().flat(), **changed})
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if changed and self._calibrating is not None:
+            self.get_logger().info(f'{", ".join(changed)}: takes effect at the next start')
+        return SetParametersResult(successful=True)
+
+    # Messages in
+
+    def _subscribe(self, kind: str, qos: QoSProfile) -> Any:
+        return self.create_subscription(
+            INPUTS[kind][0], f'~/{kind}', functools.partial(self._hear, kind), qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=functools.partial(self._meet_incompatible, kind)))
+
+    def _meet_incompatible(self, kind: str, event: Any) -> None:
+        if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
+            self._deaf.add(kind)  # the next tick replaces it, not its own callback
+        else:
+            self._warn(f'{kind}: a publisher cannot be heard, its quality of service does not match; '
+                       'publish with reliable or best-effort reliability and default deadlines')
+
+    def _hear_best_effort(self) -> None:
+        """Replace subscriptions that a best-effort publisher cannot reach."""
+        while self._deaf:
+            kind = self._deaf.pop()
+            old, self._inputs[kind] = self._inputs[kind], self._subscribe(kind, BEST_EFFORT)
+            self._empty(kind, old)
+            self.destroy_subscription(old)
+            self.get_logger().info(f'{kind}: a publisher offers best effort only; listening so')
+
+    def _empty(self, kind: str, subscription: Any) -> None:
+        """Take what waits in a subscription's queue."""
+        with subscription.handle:
+            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                self._hear(kind, taken[0])
+
+    def _hear(self, kind: str, octets: bytes) -> None:
+        """Record a message, then collect it or refuse it."""
+        self._record(kind, INPUT_TYPES[kind], octets)
+        if kind != INITIAL:
+            self._last_heard = time.monotonic()
+        try:
+            try:
+                message = deserialize_message(octets, INPUTS[kind][0])
+            except Exception as error:  # whatever the decoder meets in damaged bytes
+                raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
+                                 'check what publishes it') from error
+            self._collector.add(messages.read(kind, message))
+        except InputError as error:
+            self._refuse(str(error))
+        except Exception as error:  # a defect of ours must not take the session with it
+            self._refuse(f'{kind}: could not be used ({error!r}); {DEFECT}')
+        else:
+            if self._calibrating is None:
+                self._state, self._detail = 'collecting', ''
+
+    def _refuse(self, text: str) -> None:
+        self._last_refusal = text
+        self._warn(text)
+        self._report()
+
+    # Services
+
+    def _serve(self, act: Callable[[], str], _: Trigger.Request,
+               response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message, response.success = act(), True
+        except DloCalibrationError as error:
+            response.message, response.success = str(error), False
+        except Exception as error:
+            response.message, response.success = f'{error!r}; {DEFECT}', False
+        if not response.success:
+            self._warn(response.message)
+        self._report()
+        return response
+
+    def _start(self) -> str:
+        if self._calibrating is not None:
+            raise DloCalibrationError('a calibration is under way; wait for it, or call ~/stop first')
+        for kind, subscription in self._inputs.items():
+            self._empty(kind, subscription)  # sent before the request, so it belongs to it
+        options = self.options()
+        if options != self._collected_with:
+            self._collector = self._collector.with_options(options)
+            self._collected_with = options
+        for problem in self._collector.problems:
+            self._warn(str(problem))
+        trials = self._collector.trials
+        if not trials:
+            lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
+            raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
+        self._recorder.start(options)
+        self._started_by_itself = True  # whoever starts it, it need not start by itself any more
+        self._calibrating, self._progress = options, Progress(options.evaluations, len(trials))
+        self._state, self._detail = 'calibrating', ''
+        self._worker.start(trials, options)
+        return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
+
+    def _stop(self) -> str:
+        if self._calibrating is None:
+            raise DloCalibrationError('no calibration is under way')
+        self._worker.stop()
+        return 'the search ends now; the best so far will be the result'
+
+    def _reset(self) -> str:
+        if self._calibrating is not None:
+            raise DloCalibrationError('a calibration is under way; call ~/stop first')
+        self._recorder.end()
+        self._collected_with = self.options()
+        self._collector = TrialCollector(self._collected_with)
+        self._forget()
+        self._begin_session()
+        return 'the trials are forgotten'
+
+    def _forget(self) -> None:
+        self._state, self._detail, self._last_refusal = 'collecting', '', ''
+        self._last_heard = 0.0  # when the last action or goal chain came
+        self._started_by_itself = False
+        self._reported: dict[str, Any] = {}
+
+    # The worker's events
+
+    def _tick(self) -> None:
+        try:
+            self._hear_best_effort()
+            self._take_events()
+            self._start_by_itself()
+            self._report()
+        except Exception as error:  # a callback that raises would end the node
+            self._state, self._detail = 'failed', f'{error!r}; {DEFECT}'
+            self.get_logger().error(self._detail)
+            self._report()
+
+    def _start_by_itself(self) -> None:
+        wanted = self.get_parameter('start_after_trials').value
+        if self._calibrating is not None or self._started_by_itself \
+                or not 0 < wanted <= self._collector.count:
+            return
+        # A trial may have many goal chains; it is complete when the next one began, or nothing follows.
+        if self._collector.count > wanted or time.monotonic() - self._last_heard > QUIET:
+            self._started_by_itself = True
+            self.get_logger().info(self._start())
+
+    def _take_events(self) -> None:
+        for event in self._worker.waiting_events():
+            if isinstance(event, Evaluation):
+                self._progress.take(event)
+            else:
+                self._send_progress()
+                self._finish(event)
+        if time.monotonic() - self._progress_sent >= PROGRESS_PERIOD:
+            self._send_progress()
+
+    def _send_progress(self) -> None:
+        """Send the newest evaluation, if it was not sent yet."""
+        progress = self._progress
+        if progress.newest is None or progress.best is None:
+            return
+        self._send('progress', messages.progress(
+            self._types, stamp=self._now(), evaluation=progress.newest, best=progress.best,
+            evaluations=progress.evaluations, simulations_per_second=progress.simulations_per_second,
+            seconds_left=progress.seconds_left))
+        progress.newest, self._progress_sent = None, time.monotonic()
+
+    def _finish(self, event: CalibrationResult | Failure) -> None:
+        options, self._calibrating = self._calibrating, None
+        self._worker.join()
+        if isinstance(event, Failure):
+            self._state, self._detail = 'failed', event.text
+            self.get_logger().error(f'calibration failed: {event.text}')
+            if event.details:
+                self.get_logger().error(event.details)
+            self._report()
+            return
+        self._state, self._detail = 'done', event.stop_reason
+        found = ', '.join(f'{name} {value:.1f}' for name, value in event.values.items())
+        self.get_logger().info(f'calibrated: {found}; score {event.best.score:.1f}, mean error '
+                               f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
+        for warning in event.warnings:
+            self._warn(warning)
+        self._send('result', messages.result(self._types, event, self._now()))
+        if options is not None:
+            self._recorder.result(event, options)
+        self._report()
+
+    # Messages out
+
+    def _report(self) -> None:
+        """Send the status, where it differs from the last one."""
+        content: dict[str, Any] = {
+            'state': self._state, 'trials': self._collector.count, 'last_refusal': self._last_refusal,
+            'incomplete': self._collector.incomplete, 'detail': self._detail}
+        if content != self._reported:
+            self._reported = content
+            self._send('status', messages.status(self._types, stamp=self._now(), **content))
+
+    def _send(self, name: str, message: Any) -> None:
+        octets = serialize_message(message)
+        self._outputs[name].publish(octets)
+        self._record(name, OUTPUT_TYPES[name], octets)
+
+    def _record(self, name: str, kind: str, octets: bytes) -> None:
+        """Record a message under the node's own name for its topic, whatever that is remapped to."""
+        self._recorder.message(f'{self.get_fully_qualified_name()}/{name}', kind, octets)
+
+    def _begin_session(self) -> None:
+        self._recorder.begin(self.options())
+        if self._recorder.folder is not None:
+            self.get_logger().info(f'recording to {self._recorder.folder}')
+
+    def _fail_to_record(self, text: str) -> None:
+        self._last_refusal = text
+        self.get_logger().error(text)
+        self._report()
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+
+def _checked(flat: Mapping[str, Any]) -> Options:
+    """Return options, or refuse them, also for what only several together show."""
+    options = Options.of(flat)
+    options.space  # noqa: B018
+    return options
+
+
+def _plain(value: Any) -> Any:
+    """Return a parameter's value as options take it."""
+    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
+
+
+def _as_declared(parameters: list[Parameter]) -> list[Parameter]:
+    """Let an integer be set where a number is declared, as `ros2 param set` sends it."""
+    return [Parameter(p.name, Parameter.Type.DOUBLE, float(p.value))
+            if p.type_ == Parameter.Type.INTEGER and p.name in DECLARED
+            and isinstance(DECLARED[p.name].default, float) else p for p in parameters]
+
+
+def _descriptor(declaration: Declaration) -> ParameterDescriptor:
+    """Return what ROS tools show of an option."""
+    unit = f' [{declaration.unit}]' if declaration.unit else ''
+    descriptor = ParameterDescriptor(description=declaration.description + unit)
+    if declaration.choices:
+        descriptor.additional_constraints = f'one of {", ".join(declaration.choices)}'
+    if declaration.minimum is not None and declaration.maximum is not None:
+        low, high = declaration.minimum, declaration.maximum
+        if isinstance(declaration.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))]
+        else:
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    return descriptor

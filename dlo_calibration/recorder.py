@@ -1,0 +1,93 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Recorder: the session of a node that goes on working when the disk does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import time
+from typing import Callable
+
+from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.recording import RecordingError, SessionWriter
+from dlo_calibration.xml import write_result
+
+
+class Recorder:
+    """
+    Records one session after the other; no method raises because of the disk.
+
+    :param on_failure: called with a text, once, when a session cannot be written further.
+    """
+
+    def __init__(self, on_failure: Callable[[str], None]) -> None:
+        self._on_failure = on_failure
+        self._session: SessionWriter | None = None
+
+    @property
+    def folder(self) -> Path | None:
+        """Where the session is recorded; None where it is not."""
+        return None if self._session is None else self._session.path
+
+    def begin(self, options: Options) -> None:
+        """Begin a session in a new folder, if `options` say so."""
+        if options.record:
+            name = time.strftime('dlo_session_%Y%m%d_%H%M%S')
+            try:
+                self._session = SessionWriter(Path(options.output_directory).expanduser() / name)
+            except RecordingError as error:
+                self._on_failure(str(error))
+
+    def message(self, topic: str, kind: str, octets: bytes) -> None:
+        """Record a message: CDR `octets` of the type `kind`, as it came or went now."""
+        self._write(lambda session: session.write(topic, kind, octets, time.time_ns()))
+
+    def start(self, options: Options) -> None:
+        """Record that a calibration with `options` begins, of what was recorded so far."""
+        self._write(lambda session: session.write_options(options.flat()))
+        self._write(lambda session: session.write_mark('start'))
+
+    def result(self, result: CalibrationResult, options: Options) -> None:
+        """Write result.xml (result_2.xml, ...) into the session's folder."""
+        if self._session is not None:
+            try:
+                write_result(_free(self._session.path, 'result', '.xml'), result, options.flat())
+            except InputError as error:
+                self._on_failure(str(error))
+
+    def end(self) -> None:
+        """End the session; without one, do nothing."""
+        self._write(SessionWriter.close)
+        self._session = None
+
+    def _write(self, write: Callable[[SessionWriter], None]) -> None:
+        if self._session is None:
+            return
+        try:
+            write(self._session)
+        except RecordingError as error:
+            self._session = None  # before the report, which is a message to record
+            self._on_failure(str(error))
+
+
+def _free(folder: Path, stem: str, suffix: str) -> Path:
+    """Return a file name that is not taken."""
+    path, number = folder / f'{stem}{suffix}', 2
+    while path.exists():
+        path, number = folder / f'{stem}_{number}{suffix}', number + 1
+    return path

@@ -1,0 +1,187 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Worker: a thread that calibrates; options and trials go in, frozen events come out."""
+
+from __future__ import annotations
+
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+import queue
+import threading
+import time
+import traceback
+from typing import Callable, Iterator, Sequence, Union
+
+from dlo_calibration import pool
+from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
+from dlo_calibration.config import Options
+from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.search import SEARCHES
+from dlo_calibration.simulator import Simulator
+from dlo_calibration.trial import Trial
+
+SimulatorFactory = Callable[[Options], Simulator]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """
+    A calibration that ended without a result.
+
+    :param text: one line that says why.
+    :param details: the traceback, where the reason is a defect of the program;
+        else empty.
+    """
+
+    text: str
+    details: str = ''
+
+
+Event = Union[Evaluation, CalibrationResult, Failure]
+
+
+def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: SimulatorFactory,
+                   on_evaluation: Callable[[Evaluation], None] | None = None,
+                   should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
+    """
+    Calibrate as `options` say, in as many processes as they say.
+
+    The node and the command line both come here, so that the same trials and
+    options give the same result in both.
+
+    :raises DloCalibrationError: where there is no result.
+    """
+    space = options.space
+    search = SEARCHES[options.search](space.dimension, options.seed)
+    workers = min(options.workers or pool.cores(), options.evaluations)
+    executor = pool.process_executor(workers) if workers > 1 else None
+    simulator = make_simulator(options)
+    try:
+        return calibrate(
+            trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
+            on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
+    except BrokenProcessPool as error:
+        raise DloCalibrationError(
+            'a process that simulates ended unexpectedly (out of memory, or killed from outside); '
+            'try again with fewer workers') from error
+    finally:
+        if executor is not None:
+            pool.close(executor)
+        simulator.close()
+
+
+class Progress:
+    """
+    How far a calibration has come.
+
+    :param evaluations: how many there will be at most.
+    :param trials: simulated in each of them.
+    """
+
+    def __init__(self, evaluations: int, trials: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self.evaluations = evaluations
+        self.count = 0
+        self.newest: Evaluation | None = None
+        self.best: Evaluation | None = None
+        self._trials = trials
+        self._clock, self._begun = clock, clock()
+
+    def take(self, evaluation: Evaluation) -> None:
+        """Take the next evaluation."""
+        self.count += 1
+        self.newest = evaluation
+        if self.best is None or evaluation.score < self.best.score:
+            self.best = evaluation
+
+    @property
+    def simulations_per_second(self) -> float:
+        """Rollouts per second so far."""
+        return self.count * self._trials / self._elapsed
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until the last evaluation [s], at the speed so far; infinite before the first."""
+        left = self.evaluations - self.count
+        return self._elapsed / self.count * left if self.count else float('inf')
+
+    @property
+    def _elapsed(self) -> float:
+        return max(self._clock() - self._begun, 1e-6)
+
+
+class Worker:
+    """
+    Calibrates in a thread of its own.
+
+    `events` receives an `Evaluation` for each finished one, in order, and at the end
+    exactly one `CalibrationResult` or `Failure`.
+
+    :param make_simulator: called in the thread, so that an engine lives where it is used.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory) -> None:
+        self.events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._make_simulator = make_simulator
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Tell whether the thread still works; events may be waiting when it does not."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, trials: Sequence[Trial], options: Options) -> None:
+        """
+        Begin to calibrate.
+
+        :raises DloCalibrationError: while it is calibrating already.
+        """
+        if self.alive:
+            raise DloCalibrationError('a calibration is under way already')
+        self._stop = threading.Event()
+        self._thread = threading.Thread(
+            target=self._work, args=(tuple(trials), options, self._stop), name='calibration', daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the calibration to end with the best so far; returns at once."""
+        self._stop.set()
+
+    def waiting_events(self) -> Iterator[Event]:
+        """Take what waits in `events`, without waiting for more."""
+        while True:
+            try:
+                yield self.events.get_nowait()
+            except queue.Empty:
+                return
+
+    def join(self, timeout: float | None = None) -> bool:
+        """Wait until the thread has ended, `timeout` [s] at most; return whether it has."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+        return not self.alive
+
+    def _work(self, trials: Sequence[Trial], options: Options, stop: threading.Event) -> None:
+        event: Event
+        try:
+            event = calibrate_with(trials, options, self._make_simulator, self.events.put, stop.is_set)
+        except DloCalibrationError as error:
+            event = Failure(str(error))
+        except BaseException as error:  # a thread that dies silently leaves the user waiting for ever
+            text = ' '.join(str(error).split())
+            event = Failure(f'{type(error).__name__}: {text}' if text else type(error).__name__,
+                            traceback.format_exc())
+        self.events.put(event)

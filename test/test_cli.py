@@ -1,0 +1,289 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The command line: what it prints, where, and how it ends."""
+
+import json
+import math
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from toy_messages import session_messages, toy_trials, TRUTH, write_session
+from toy_simulator import ToySimulator
+
+from dlo_calibration import cli
+from dlo_calibration.config import declarations, Options
+from dlo_calibration.messages import bag_types, INITIAL
+from dlo_calibration.session import read_session
+from dlo_calibration.worker import calibrate_with
+
+FIT_KEYS = {
+    'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',
+    'error_percent_of_length', 'trials', 'evaluations', 'simulations', 'seconds', 'engine', 'search', 'seed',
+    'stop_reason'}
+PARAMETER_KEYS = {'value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper',
+                  'physical_unit', 'identifiable'}
+PATIENCE = 60.0
+TYPES = bag_types()
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Give a session of two trials, recorded with options."""
+    return write_session(tmp_path / 'recorded', session_messages(TYPES, 2), {'evaluations': 20, 'workers': 1})
+
+
+@pytest.fixture
+def run(capsys):
+    """Give a function that returns exit code, stdout and stderr of a command with the toy."""
+    def run(*words, toy=None):
+        try:
+            code = cli.main([str(word) for word in words], lambda options: toy or ToySimulator())
+        except SystemExit as end:  # argparse
+            code = end.code
+        output, errors = capsys.readouterr()
+        return code, output, errors
+
+    return run
+
+
+def only_json(output):
+    """Return the one JSON document of an output, which holds finite numbers only."""
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    return json.loads(output, parse_constant=refuse)
+
+
+def test_fit_prints_one_document_with_every_key(run, session):
+    code, output, _ = run('fit', session, '--json')
+    found = only_json(output)
+    assert code == 0
+    assert set(found) >= FIT_KEYS
+    assert list(found['parameters']) == list(Options().calibrate)
+    assert all(set(one) == PARAMETER_KEYS for one in found['parameters'].values())
+    assert (found['trials'], found['evaluations'], found['simulations']) == (2, 20, 40)
+    assert (found['engine'], found['search'], found['seed']) == ('toy', 'random', 1)
+    assert len(found['scores']) == 2
+    assert found['score'] == pytest.approx(sum(found['scores']) / 2)
+    assert found['mean_error_m'] <= found['rms_error_m'] <= found['max_error_m']
+    assert found['error_percent_of_length'] == pytest.approx(100 * found['mean_error_m'], rel=0.01)  # of 1 m
+
+
+def test_fit_gives_what_the_library_gives(run, session):
+    found = only_json(run('fit', session, '--json')[1])
+    result = calibrate_with(toy_trials(2), Options.of({'evaluations': 20}), lambda _: ToySimulator())
+    assert {name: one['value'] for name, one in found['parameters'].items()} == pytest.approx(result.values)
+
+
+def test_flags_come_before_recorded_options_and_say_so(run, session):
+    code, output, errors = run('fit', session, '--json', '--evaluations', 5, '--seed', 9)
+    assert code == 0
+    assert (only_json(output)['evaluations'], only_json(output)['seed']) == (5, 9)
+    assert 'evaluations: 5 instead of 20' in errors
+
+
+def test_fit_for_people_has_both_units_and_says_what_is_not_identifiable(run, session):
+    code, output, _ = run('fit', session, '--evaluations', 3)
+    assert code == 0
+    for word in ('flexibility', 'N m^2', 'not identifiable', 'difference score', 'mean error'):
+        assert word in output
+    assert '\x1b' not in output  # no colours into a pipe
+
+
+def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_path):
+    folder = tmp_path / 'new' / 'out'
+    first = only_json(run('fit', session, '--json', '--output', folder, '--evaluations', 8)[1])
+    assert {file.name for file in folder.iterdir()} == {'result.xml', 'session.mcap', 'report.html'}
+    again = only_json(run('fit', folder / 'session.mcap', '--json', '--evaluations', 8)[1])
+    assert again['parameters'] == first['parameters']
+    report = (folder / 'report.html').read_text()
+    assert report.count('data:image/png;base64,') == 2
+    assert '--evaluations 8' in report
+    assert not re.search('(src|href)="(?!data:)', report)  # it needs nothing else
+
+
+def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
+    fitted = only_json(run('fit', session, '--json', '--output', tmp_path / 'out')[1])
+    code, output, _ = run('validate', tmp_path / 'out' / 'result.xml', session, '--json')
+    found = only_json(output)
+    assert code == 0
+    assert set(found) >= FIT_KEYS
+    assert found['parameters'] == fitted['parameters']
+    assert (found['score'], found['scores']) == (fitted['score'], fitted['scores'])
+    assert found['mean_error_m'] == fitted['mean_error_m']
+    assert (found['evaluations'], found['simulations']) == (1, 2)
+
+
+def test_validate_on_another_session_uses_the_results_parameters(run, session, tmp_path):
+    run('fit', session, '--output', tmp_path / 'out')
+    other = write_session(tmp_path / 'other', session_messages(TYPES, 1, first=4), {'seed': 5})
+    found = only_json(run('validate', tmp_path / 'out' / 'result.xml', other, '--json')[1])
+    assert found['trials'] == 1
+    assert found['seed'] == 1
+
+
+def test_info_tells_what_is_in_a_session(run, session):
+    code, output, _ = run('info', session, '--json')
+    found = only_json(output)
+    assert code == 0
+    assert [trial['name'] for trial in found['trials']] == ['trial 1', 'trial 2']
+    trial = found['trials'][0]
+    assert (trial['points'], trial['stable_goals'], trial['timed_goals']) == (11, 1, 0)
+    assert trial['length_m'] == pytest.approx(1.0)
+    assert [hand['name'] for hand in trial['hands']] == ['left_hand']
+    assert found['frames'] == ['world']
+    assert found['refusals'] == found['problems'] == []
+    assert 'left_hand' in run('info', session)[1]
+
+
+def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
+    pairs = session_messages(TYPES, 2)
+    pairs[5][1].header.frame_id = 'camera'
+    path = write_session(tmp_path / 'wrong', pairs)
+    code, output, _ = run('info', path, '--json')
+    found = only_json(output)
+    assert code == 0
+    assert len(found['trials']) == 1
+    assert any('camera' in text for text in found['refusals'])
+    assert 'camera' in run('fit', path, '--json', '--evaluations', 2)[2]
+
+
+def test_session_without_complete_trial_is_refused_by_fit_and_described_by_info(run, tmp_path):
+    path = write_session(tmp_path / 'half', session_messages(TYPES, 1)[:1])
+    assert run('info', path)[0] == 0
+    code, output, errors = run('fit', path, '--json')
+    assert (code, output) == (2, '')
+    assert 'no complete trial' in errors
+
+
+@pytest.mark.parametrize('words', [
+    [], ['paint'], ['fit'], ['fit', 'SESSION', '--masss', '1'], ['fit', 'SESSION', '--mass', 'heavy'],
+    ['fit', 'SESSION', '--mass', '-1'], ['fit', 'SESSION', '--search', 'magic'],
+    ['fit', 'SESSION', '--calibrate', 'colour'], ['fit', 'SESSION', '--calibrate', 'friction,friction'],
+    ['fit', 'SESSION', '--evaluations', '0'], ['fit', 'nowhere'], ['info', 'nowhere'], ['info', 'TEXT'],
+    ['validate', 'nowhere', 'SESSION'], ['validate', 'TEXT', 'SESSION'],
+    ['fit', 'SESSION', '--output', 'TEXT'], ['fit', 'SESSION', '--eval', '3'],
+], ids=' '.join)
+@pytest.mark.parametrize('as_json', [False, True], ids=['', 'json'])
+def test_what_cannot_be_used_ends_with_one_line_and_exit_code_2(run, session, tmp_path, words, as_json):
+    text = tmp_path / 'text'
+    text.write_text('nothing of ours')
+    names = {'SESSION': session, 'TEXT': text}
+    code, output, errors = run(*(names.get(word, word) for word in words), *(['--json'] if as_json else []))
+    assert (code, output) == (2, '')
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith('dlo-calibration')
+
+
+def test_trials_that_cannot_be_simulated_end_with_one_line(run, session):
+    code, output, errors = run('fit', session, '--json', toy=ToySimulator(fail_below=101))
+    assert (code, output) == (2, '')
+    assert 'diverged' in errors
+
+
+def test_every_option_is_a_flag_with_either_hyphen(run, session):
+    flat = Options().flat()
+    for declaration in declarations():
+        if declaration.choices or declaration.name in ('evaluations', 'output_directory'):
+            continue
+        for name in {declaration.name, declaration.name.replace('_', '-')}:
+            value = flat[declaration.name]
+            words = [f'--{name}', value]
+            if isinstance(value, bool):
+                words = [f'--{name}' if value else f'--no-{name}']
+            assert run('info', session, *words)[0] == 0, words
+
+
+def test_lists_are_given_as_words_or_with_commas(run, session):
+    for words in (['flexibility', 'friction'], ['flexibility,friction']):
+        found = only_json(run('fit', session, '--json', '--calibrate', *words)[1])
+        assert list(found['parameters']) == ['flexibility', 'friction']
+
+
+def test_an_option_that_is_no_parameter_of_the_search_stays_at_its_value(run, session):
+    flags = [f for name in ('elasticity', 'friction', 'self_collision') for f in (f'--{name}', TRUTH[name])]
+    flags += ['--calibrate', 'flexibility', '--evaluations', 200]
+    found = only_json(run('fit', session, '--json', *flags)[1])
+    assert found['parameters']['flexibility']['value'] == pytest.approx(TRUTH['flexibility'], abs=1)
+
+
+def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
+    def unit(*flags):
+        found = only_json(run('fit', session, '--json', *flags)[1])
+        return found['parameters']['flexibility']['physical_unit']
+
+    assert unit() == 'N m^2 per N/m'
+    assert unit('--mass', '0.05') == 'N m^2'
+
+
+PROGRAM = """
+import sys
+from toy_simulator import ToySimulator
+from dlo_calibration import cli
+
+if __name__ == '__main__':
+    sys.exit(cli.main(sys.argv[2:], lambda options: ToySimulator(float(sys.argv[1]))))
+"""
+
+
+@pytest.mark.parametrize(('workers', 'seconds', 'code'), [(1, 0.01, 0), (2, 0.01, 0), (2, 600.0, 130)])
+def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, seconds, code):
+    process = subprocess.Popen(
+        [sys.executable, '-c', PROGRAM, str(seconds), 'fit', str(session), '--json',
+         '--evaluations', '5000', '--workers', str(workers), '--output', str(tmp_path / 'out')],
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    begun = time.monotonic()
+    while not (tmp_path / 'out' / 'report.html').exists():  # claimed before the search begins
+        assert time.monotonic() - begun < PATIENCE
+        time.sleep(0.01)
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == code, errors
+    assert 'Traceback' not in errors
+    if code:
+        assert output == ''
+    else:
+        assert only_json(output)['stop_reason'] == 'stopped on request'
+        assert read_session(tmp_path / 'out' / 'session.mcap').messages[0][0] == INITIAL
+
+
+def test_module_is_the_command(session):
+    done = subprocess.run(
+        [sys.executable, '-m', 'dlo_calibration', 'info', str(session), '--json'],
+        capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
+    assert done.returncode == 0
+    assert done.stderr == ''
+    assert len(only_json(done.stdout)['trials']) == 2
+
+
+def test_infinity_is_null_in_json():
+    assert cli._finite({'a': [math.inf, 1.0], 'b': float('nan')}) == {'a': [None, 1.0], 'b': None}
+
+
+def test_output_folder_may_be_that_of_the_session(run, session, tmp_path):
+    copy = tmp_path / 'out' / 'session.mcap'
+    run('fit', session, '--output', tmp_path / 'out')
+    before = copy.read_bytes()
+    assert run('fit', copy, '--output', tmp_path / 'out')[0] == 0
+    assert Path(copy).read_bytes() == before

@@ -1,0 +1,78 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The demo works, and ends what it started."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from dlo_calibration.demo import samples
+from dlo_calibration.session import read_session
+
+pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
+pytest.importorskip('pybullet', reason='needs PyBullet')
+
+PATIENCE = 120.0
+
+
+def demo(environment, *arguments):
+    return subprocess.Popen(
+        [sys.executable, '-m', 'dlo_calibration.demo', *arguments], text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)})
+
+
+def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path):
+    process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '4')
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, errors
+    for word in ('flexibility', 'N m^2', 'mean error', 'demo.png'):
+        assert word in output
+    assert (tmp_path / 'out' / 'demo.png').read_bytes().startswith(b'\x89PNG')
+    folder, = (tmp_path / 'out').glob('dlo_session_*')
+    assert (folder / 'result.xml').exists()
+    assert read_session(folder).problems == ()
+
+
+def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path):
+    process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '1000')
+    begun = time.monotonic()
+    while not list((tmp_path / 'out').glob('dlo_session_*')):
+        assert time.monotonic() - begun < PATIENCE
+        assert process.poll() is None
+        time.sleep(0.02)
+    listing = subprocess.run(['ps', '--ppid', str(process.pid), '-o', 'pid='], stdout=subprocess.PIPE)
+    children = [int(pid) for pid in listing.stdout.split()]
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert children
+    assert not any(os.path.exists(f'/proc/{pid}') for pid in children)
+
+
+def test_demo_says_what_is_wrong_with_a_sample(ros_environment, tmp_path):
+    process = demo(ros_environment, '--output', str(tmp_path), '--sample', str(tmp_path / 'nowhere'))
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert len(errors.splitlines()) == 1
+    assert 'nowhere' in errors
+
+
+def test_samples_are_found():
+    assert (samples() / 'object1').is_dir()

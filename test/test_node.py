@@ -1,0 +1,530 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The node over a real graph: what robot software sees."""
+
+from contextlib import contextmanager
+import functools
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
+from toy_simulator import ToySimulator
+
+from dlo_calibration import cli, InputError
+from dlo_calibration.config import declarations, Options
+from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types, result_values
+from dlo_calibration.session import read_session
+from dlo_calibration.xml import read_result
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
+pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.msg import Log  # noqa: E402
+from rclpy.context import Context  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rclpy.signals import SignalHandlerOptions  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from dlo_calibration.node import CalibratorNode  # noqa: E402
+
+PATIENCE = 60.0  # s
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+CHILD = Path(__file__).parent / 'toy_calibrator.py'
+TYPES = rclpy_types()
+LOG_WARN = 30  # rcl_interfaces/msg/Log
+
+
+class Robot:
+    """Robot software: publishes, calls and listens; spins the node too, where it is in this process."""
+
+    def __init__(self, context, reliability=ReliabilityPolicy.RELIABLE):
+        self.context = context
+        self.node = Node('robot', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.calibrator = None
+        self.heard = {'progress': [], 'status': [], 'result': [], 'log': []}
+        for name in ('progress', 'status', 'result'):
+            self.listen(name, LATCHED if name != 'progress' else QoSProfile(depth=1000))
+        self.node.create_subscription(Log, '/rosout', self.heard['log'].append, QoSProfile(depth=100))
+        qos = QoSProfile(depth=1000, reliability=reliability)
+        self.publishers = {kind: self.node.create_publisher(TYPES.find(name), f'/calibrator/{kind}', qos)
+                           for kind, name in INPUT_TYPES.items()}
+        self.clients = {name: self.node.create_client(Trigger, f'/calibrator/{name}')
+                        for name in ('start', 'stop', 'reset')}
+
+    def listen(self, name, qos):
+        self.node.create_subscription(DiagnosticArray, f'/calibrator/{name}', self.heard[name].append, qos)
+
+    def until(self, condition, why='it never happened'):
+        begun = time.monotonic()
+        while not condition():
+            assert time.monotonic() - begun < PATIENCE, f'{why}; status {self.status}'
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def matched(self):
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values())
+                   and all(c.service_is_ready() for c in self.clients.values()) and self.heard['status'])
+
+    def send(self, pairs):
+        self.matched()
+        for kind, message in pairs:
+            self.publishers[kind].publish(message)
+
+    def call(self, name):
+        future = self.clients[name].call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+    @property
+    def status(self):
+        return values(self.heard['status'][-1].status[0]) if self.heard['status'] else {}
+
+    def until_status(self, **expected):
+        self.until(lambda: expected.items() <= self.status.items(), str(expected))
+
+    def until_result(self, count=1):
+        results = self.heard['result']
+        self.until(lambda: len(results) >= count or self.status['state'] == 'failed', 'no result')
+        assert self.status['state'] != 'failed', self.status
+        self.until_status(state='done')
+        return self.heard['result'][-1]
+
+
+def values(status):
+    return {pair.key: pair.value for pair in status.values}
+
+
+def whole(result):
+    return values(next(one for one in result.status if one.name == 'calibration'))
+
+
+@contextmanager
+def robot_of(environment, **arguments):
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=int(environment['ROS_DOMAIN_ID']),
+               signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        robot = Robot(context, **arguments)
+        yield robot
+        robot.executor.shutdown()
+        robot.node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
+@pytest.fixture
+def start_node(ros_environment, tmp_path):
+    """Give a function that starts the node in this process, with the toy, and returns the robot."""
+    with robot_of(ros_environment) as robot:
+        def start(toy=None, **parameters):
+            parameters = {'output_directory': str(tmp_path), 'workers': 1, 'evaluations': 30, **parameters}
+            robot.calibrator = CalibratorNode(
+                functools.partial(lambda toy, _: toy, toy or ToySimulator()), context=robot.context,
+                parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()])
+            robot.executor.add_node(robot.calibrator)
+            robot.matched()
+            return robot
+
+        yield start
+        if robot.calibrator is not None:
+            robot.calibrator.close()
+
+
+def folders(path):
+    return sorted(path.glob('dlo_session_*'))
+
+
+def fitted(session, capsys, *flags):
+    """Return the JSON of `fit` with the toy."""
+    assert cli.main(['fit', str(session), '--json', *flags], lambda _: ToySimulator()) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_node, tmp_path, capsys):
+    robot = start_node(seed=7, workers=2)
+    robot.send(session_messages(TYPES, 3))
+    robot.until_status(state='collecting', trials='3')
+    assert robot.call('start').success
+    live = robot.until_result()
+    assert [one.name for one in live.status] == [*Options().calibrate, 'calibration']
+    assert whole(live)['trials'] == '3'
+    assert whole(live)['seed'] == '7'
+    robot.until(lambda: robot.heard['progress'])
+    last = values(robot.heard['progress'][-1].status[0])
+    assert (last['evaluation'], last['evaluations']) == ('30', '30')
+    assert last['best_score'] == whole(live)['score']
+    robot.calibrator.close()
+
+    folder, = folders(tmp_path)
+    replayed = fitted(folder, capsys)
+    found = result_values(live)
+    for name, estimate in replayed['parameters'].items():
+        for key, value in estimate.items():
+            assert repr(value) == repr(found[name][key]), (name, key)
+    assert [repr(score) for score in replayed['scores']] == whole(live)['scores'].split()
+    written = read_result(folder / 'result.xml')
+    assert written.values == {name: one['value'] for name, one in replayed['parameters'].items()}
+    kinds = {record.name for record in read_session(folder).records}
+    assert kinds == {*INPUT_TYPES, 'progress', 'status', 'result'}
+
+
+def test_what_comes_after_the_start_is_for_the_next_one(start_node, tmp_path, capsys):
+    robot = start_node(ToySimulator(0.02))
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    robot.send(session_messages(TYPES, 1, first=1))
+    first = robot.until_result()
+    robot.until_status(trials='2')
+    assert whole(first)['trials'] == '1'
+    folder, = folders(tmp_path)
+    assert repr(fitted(folder, capsys)['score']) == whole(first)['score']
+    robot.call('start')
+    second = robot.until_result(2)
+    assert whole(second)['trials'] == '2'
+    assert repr(fitted(folder, capsys)['score']) == whole(second)['score']
+    assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_2.xml'}
+
+
+def test_late_listener_gets_result_and_status(start_node):
+    robot = start_node()
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    robot.until_result()
+    for name in ('result', 'status'):
+        before = len(robot.heard[name])
+        robot.listen(name, LATCHED)
+        robot.until(lambda name=name, before=before: len(robot.heard[name]) > before)
+    assert values(robot.heard['status'][-1].status[0])['state'] == 'done'
+
+
+def test_start_without_a_complete_trial_is_refused_and_says_what_is_missing(start_node):
+    robot = start_node()
+    answer = robot.call('start')
+    assert not answer.success
+    assert 'initial_chain' in answer.message
+    robot.send(session_messages(TYPES, 1)[:2])
+    robot.until(lambda: 'goal_chain' in robot.status['incomplete'])
+    answer = robot.call('start')
+    assert not answer.success
+    assert 'goal_chain' in answer.message
+    robot.send(session_messages(TYPES, 1)[2:])
+    robot.until_status(trials='1')
+    assert robot.call('start').success
+
+
+def test_requests_are_answered_while_it_calibrates_and_stop_gives_the_best_so_far(start_node):
+    robot = start_node(ToySimulator(0.01), evaluations=10000)
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    assert not robot.call('stop').success
+    assert robot.call('start').success
+    robot.until(lambda: robot.heard['progress'])
+    robot.until_status(state='calibrating')
+    for refused in ('start', 'reset'):
+        answer = robot.call(refused)
+        assert not answer.success
+        assert 'under way' in answer.message
+    before = len(robot.heard['progress'])
+    robot.until(lambda: len(robot.heard['progress']) > before)
+    assert robot.call('stop').success
+    result = robot.until_result()
+    assert whole(result)['stop_reason'] == 'stopped on request'
+    assert 0 < int(whole(result)['evaluations']) < 10000
+
+
+def test_reset_forgets_the_trials_and_begins_another_session(start_node, tmp_path, capsys):
+    robot = start_node()
+    robot.send(session_messages(TYPES, 2))
+    robot.until_status(trials='2')
+    assert robot.call('reset').success
+    robot.until_status(trials='0')
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    live = robot.until_result()
+    first, second = folders(tmp_path)
+    assert repr(fitted(second, capsys)['score']) == whole(live)['score']
+    assert len(read_session(first).messages) == 6
+
+
+def bad_cloud():
+    (_, cloud), *_ = session_messages(TYPES, 1, first=5)
+    cloud.header.stamp.sec = 0
+    cloud.header.stamp.nanosec = 0
+    return cloud
+
+
+def foreign_frame():
+    return trial_messages(TYPES, toy_trials(1)[0], 9 * MINUTE, 'camera')[0][1]
+
+
+@pytest.mark.parametrize(('message', 'words'), [
+    (bad_cloud, ('stamp of zero', 'header.stamp')),
+    (foreign_frame, ('camera', 'world')),
+], ids=['stamp of zero', 'another frame'])
+def test_refusal_reaches_status_and_log_and_the_trials_stay(start_node, message, words):
+    robot = start_node()
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.send([(INITIAL, message())])
+    robot.until(lambda: robot.status['last_refusal'])
+    for word in ('initial_chain', *words):
+        assert word in robot.status['last_refusal']
+    assert robot.status['trials'] == '1'
+    robot.until(lambda: any(log.msg == robot.status['last_refusal'] for log in robot.heard['log']))
+    warning, = (log for log in robot.heard['log'] if log.msg == robot.status['last_refusal'])
+    assert warning.level == LOG_WARN
+    assert robot.call('start').success
+    robot.until_result()
+
+
+def test_best_effort_publishers_are_heard(start_node, ros_environment):
+    robot = start_node()
+    with robot_of(ros_environment, reliability=ReliabilityPolicy.BEST_EFFORT) as tracker:
+        def sees_all():
+            robot.executor.spin_once(timeout_sec=0.01)
+            return all(p.get_subscription_count() for p in tracker.publishers.values())
+
+        tracker.until(sees_all, 'the subscriptions never matched')
+        for pair in session_messages(TYPES, 1):
+            tracker.publishers[pair[0]].publish(pair[1])
+        robot.until_status(trials='1')
+    robot.send(session_messages(TYPES, 1, first=1))  # reliable ones are heard as before
+    robot.until_status(trials='2')
+
+
+def test_burst_of_goal_chains_arrives_whole(start_node, tmp_path):
+    robot = start_node()
+    initial, action, (_, goal) = session_messages(TYPES, 1)
+    robot.send([initial, action])
+    robot.until(lambda: robot.status['incomplete'].startswith('a goal_chain'))
+    for k in range(500):
+        goal.header.stamp.nanosec = 2_000_000 * k
+        robot.publishers[GOAL].publish(goal)
+    assert robot.call('start').success
+    robot.until_result()
+    robot.calibrator.close()
+    session = read_session(folders(tmp_path)[0])
+    assert sum(record.name == GOAL for record in session.records) == 500
+
+
+def test_starts_by_itself_after_enough_trials(start_node):
+    robot = start_node(start_after_trials=2)
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.send(session_messages(TYPES, 1, first=1))
+    assert whole(robot.until_result())['trials'] == '2'
+
+
+def test_failure_of_the_engine_reaches_status_and_the_node_stays(start_node):
+    toy = ToySimulator(crash=True)
+    robot = start_node(toy)
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    robot.until_status(state='failed', detail='RuntimeError: the toy is broken')
+    toy.crash = False
+    assert robot.call('start').success
+    robot.until(lambda: robot.heard['result'])
+    robot.until_status(state='done')
+
+
+def test_disk_that_refuses_is_reported_and_the_node_goes_on(start_node, tmp_path):
+    taken = tmp_path / 'file'
+    taken.write_text('not a folder')
+    robot = start_node(output_directory=str(taken))
+    robot.until(lambda: str(taken) in robot.status['last_refusal'])
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    robot.until_result()
+
+
+def test_nothing_is_written_where_recording_is_off(start_node, tmp_path):
+    robot = start_node(record=False)
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    robot.until_result()
+    robot.calibrator.close()
+    assert not folders(tmp_path)
+
+
+def test_every_option_is_a_parameter_with_description_unit_and_range(start_node):
+    node = start_node().calibrator
+    for declaration in declarations():
+        descriptor = node.describe_parameter(declaration.name)
+        assert declaration.description in descriptor.description
+        assert declaration.unit in descriptor.description
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        if declaration.minimum is not None:
+            assert (ranges[0].from_value, ranges[0].to_value) == (declaration.minimum, declaration.maximum)
+
+
+@pytest.mark.parametrize(('name', 'value', 'reason'), [
+    ('search', 'magic', 'random'),
+    ('calibrate', ['flexibility', 'colour'], 'colour'),
+    ('calibrate', ['friction', 'friction'], 'different'),
+    ('mass', -1.0, ''),
+    ('evaluations', 0, ''),
+    ('table', 3, ''),
+])
+def test_bad_value_is_refused_with_the_reason_and_changes_nothing(start_node, name, value, reason):
+    node = start_node().calibrator
+    before = node.options()
+    answer, = node.set_parameters([Parameter(name, value=value)])
+    assert not answer.successful
+    assert reason in answer.reason
+    assert answer.reason
+    assert node.options() == before
+
+
+def test_integer_may_be_set_where_a_number_is_meant(start_node):
+    node = start_node(table_height=1).calibrator
+    assert node.options().table_height == 1.0
+    assert node.set_parameters([Parameter('mass', value=2)])[0].successful
+    assert node.options().mass == 2.0
+
+
+def test_changed_parameters_count_at_the_next_start_and_in_the_replay(start_node, tmp_path, capsys):
+    robot = start_node(grip_tolerance=0.0)
+    trial = toy_trials(1)[0]
+    pairs = trial_messages(TYPES, trial, MINUTE)
+    for point in pairs[1][1].points:
+        point.transforms[0].translation.z += 0.01  # the hand closes 1 cm above the point
+    robot.send(pairs)
+    robot.until(lambda: 'grip_tolerance' in robot.status['last_refusal'])
+    assert robot.calibrator.set_parameters([
+        Parameter('grip_tolerance', value=0.05), Parameter('evaluations', value=12)])[0].successful
+    assert robot.call('start').success
+    live = whole(robot.until_result())
+    assert live['evaluations'] == '12'
+    assert repr(fitted(folders(tmp_path)[0], capsys)['score']) == live['score']
+
+
+def test_unknown_parameter_is_refused_when_the_node_is_made(start_node):
+    with pytest.raises(InputError, match='masss'):
+        start_node(masss=1.0)
+
+
+@contextmanager
+def child(environment, folder, *arguments, seconds=0.0):
+    """Run the node with the toy in a process of its own."""
+    folder.mkdir(exist_ok=True)
+    process = subprocess.Popen(
+        [sys.executable, str(CHILD), str(seconds), '--ros-args', '-p', f'output_directory:={folder}',
+         *arguments],
+        env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ended(process):
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert 'Traceback' not in errors, errors
+    return process.returncode
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, number):
+    with child(ros_environment, tmp_path / 'out', '-p', 'workers:=2', '-p', 'evaluations:=10000',
+               seconds=0.01) as process, robot_of(ros_environment) as robot:
+        robot.send(session_messages(TYPES, 1))
+        robot.until_status(trials='1')
+        robot.call('start')
+        robot.until(lambda: robot.heard['progress'])
+        for _ in range(2):  # to its processes too, as Ctrl-C in a terminal or a service's stop
+            os.killpg(process.pid, number)
+        assert ended(process) == 0
+    folder, = folders(tmp_path / 'out')
+    session = read_session(folder)
+    assert session.problems == ()
+    assert {kind for kind, _ in session.messages} == {INITIAL, ACTION, GOAL}
+    assert session.outputs('result')  # the best so far is kept
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('delay', [0.5, 0.9, 1.4, 2.5])
+def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_path, number, delay):
+    marker = tmp_path / 'listening'
+    program = (
+        'import sys, pathlib; from dlo_calibration.signals import StopFlag; '
+        f'stop = StopFlag(); stop.listen(); pathlib.Path({str(marker)!r}).touch(); '
+        'from dlo_calibration.node import spin; '
+        'code = spin(sys.argv[1:], stop); stop.ignore(); sys.exit(code)')
+    process = subprocess.Popen(
+        [sys.executable, '-c', program, '--ros-args', '-p', f'output_directory:={tmp_path}'], text=True,
+        env={**ros_environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stderr=subprocess.PIPE)
+    try:
+        begun = time.monotonic()
+        while not marker.exists():
+            assert time.monotonic() - begun < PATIENCE
+            time.sleep(0.005)
+        time.sleep(delay - 0.5)
+        process.send_signal(number)
+        assert ended(process) == 0
+    finally:
+        process.kill()
+    for folder in folders(tmp_path):
+        assert (folder / 'metadata.yaml').exists()
+
+
+def test_killed_node_leaves_a_readable_session_and_no_processes(ros_environment, tmp_path, capsys):
+    with child(ros_environment, tmp_path / 'out', '-p', 'workers:=2', '-p', 'evaluations:=10000',
+               seconds=0.01) as process, robot_of(ros_environment) as robot:
+        robot.send(session_messages(TYPES, 2))
+        robot.until_status(trials='2')
+        robot.call('start')
+        robot.until(lambda: robot.heard['progress'])
+        listing = subprocess.run(['ps', '--ppid', str(process.pid), '-o', 'pid='], stdout=subprocess.PIPE)
+        children = [int(pid) for pid in listing.stdout.split()]
+        assert len(children) >= 2
+        process.kill()
+        process.wait()
+        robot.until(lambda: not any(Path(f'/proc/{pid}').exists() for pid in children))
+    folder, = folders(tmp_path / 'out')
+    session = read_session(folder)
+    assert sorted(kind for kind, _ in session.messages) == sorted([INITIAL, ACTION, GOAL] * 2)
+    assert session.outputs('progress')
+    assert fitted(folder, capsys, '--evaluations', '10')['trials'] == 2
+
+
+@pytest.mark.parametrize('arguments', [
+    ('-p', 'masss:=1.0'), ('-p', 'mass:=-1.0'), ('-p', 'mass:=heavy'), ('-p', 'mass'), ('--nonsense',)])
+def test_bad_command_line_ends_with_one_line_and_exit_code_2(ros_environment, tmp_path, arguments):
+    with child(ros_environment, tmp_path / 'out', *arguments) as process:
+        output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert output == ''
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith('calibrator: ')

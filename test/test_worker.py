@@ -1,0 +1,251 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The worker: events in order, exactly one end, whatever happens; processes that do not outlive it."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials, TRUTH
+from toy_simulator import ToySimulator
+
+from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation, pool
+from dlo_calibration.config import ENGINES as ENGINE_NAMES
+from dlo_calibration.config import Options
+from dlo_calibration.engines import ENGINES
+from dlo_calibration.worker import calibrate_with, Failure, Progress, Worker
+
+ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 60.0
+
+
+def finished(worker):
+    """Wait for the end, and return all events."""
+    assert worker.join(PATIENCE)
+    return list(worker.waiting_events())
+
+
+def options(**flat):
+    return Options.of({'workers': 1, 'evaluations': 30, **flat})
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_gives_every_evaluation_in_order_and_then_the_result(workers):
+    worker = Worker(lambda _: ToySimulator())
+    worker.start(toy_trials(2), options(workers=workers))
+    *evaluations, result = finished(worker)
+    assert [e.index for e in evaluations if isinstance(e, Evaluation)] == list(range(30))
+    assert isinstance(result, CalibrationResult)
+    assert result.best.score == min(e.score for e in evaluations)
+
+
+def test_result_does_not_depend_on_the_number_of_processes():
+    one, three = (calibrate_with(toy_trials(2), options(workers=n), lambda _: ToySimulator()) for n in (1, 3))
+    assert one.values == three.values
+    assert one.best.scores == three.best.scores
+    assert all(np.array_equal(a, b) for a, b in zip(one.chains, three.chains, strict=True))
+    assert one.parameters == three.parameters
+
+
+@pytest.mark.parametrize('name', ['flexibility', 'elasticity', 'friction'])
+def test_finds_the_truth_of_one_parameter_where_the_others_are_known(name):
+    known = {other: value for other, value in TRUTH.items() if other != name}
+    result = calibrate_with(toy_trials(2), options(evaluations=300, calibrate=[name], **known),
+                            lambda _: ToySimulator())
+    assert abs(result.values[name] - TRUTH[name]) < 1
+    assert result.parameters[name].identifiable
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_defect_of_an_engine_ends_as_a_failure_of_one_line(workers):
+    worker = Worker(lambda _: ToySimulator(crash=True))
+    worker.start(toy_trials(1), options(workers=workers))
+    failure, = finished(worker)
+    assert isinstance(failure, Failure)
+    assert failure.text == 'RuntimeError: the toy is broken'
+    assert 'Traceback' in failure.details
+
+
+def test_engine_that_cannot_be_made_ends_as_a_failure():
+    def broken(_):
+        raise ImportError('no such engine')
+
+    worker = Worker(broken)
+    worker.start(toy_trials(1), options())
+    assert 'no such engine' in finished(worker)[-1].text
+
+
+def test_trials_that_cannot_be_simulated_end_as_a_failure_that_says_why():
+    worker = Worker(lambda _: ToySimulator(fail_below=101))
+    worker.start(toy_trials(1), options(evaluations=5))
+    *evaluations, failure = finished(worker)
+    assert len(evaluations) == 5
+    assert 'trial 1: diverged' in failure.text
+    assert not failure.details
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_stop_gives_the_best_so_far(workers):
+    worker = Worker(lambda _: ToySimulator(0.005))
+    worker.start(toy_trials(1), options(workers=workers, evaluations=10000))
+    first = worker.events.get(timeout=PATIENCE)
+    worker.stop()
+    *evaluations, result = [first, *finished(worker)]
+    assert result.stop_reason == 'stopped on request'
+    assert len(result.evaluations) == len(evaluations) < 10000
+    assert result.best.score == min(e.score for e in evaluations)
+
+
+def test_stop_does_not_wait_for_a_simulation_in_another_process():
+    worker = Worker(lambda _: ToySimulator(10 * PATIENCE))
+    worker.start(toy_trials(1), options(workers=2))
+    children = spawned(os.getpid(), 2)
+    worker.stop()
+    failure, = finished(worker)
+    assert 'stopped before the first evaluation' in failure.text
+    assert not any(Path(f'/proc/{pid}').exists() for pid in children)
+
+
+def test_refuses_a_second_start_and_takes_the_next_one():
+    worker = Worker(lambda _: ToySimulator(0.005))
+    worker.start(toy_trials(1), options(evaluations=10000))
+    with pytest.raises(DloCalibrationError, match='under way'):
+        worker.start(toy_trials(1), options())
+    worker.stop()
+    finished(worker)
+    worker.start(toy_trials(1), options())
+    assert isinstance(finished(worker)[-1], CalibrationResult)
+
+
+def test_killed_process_ends_as_a_failure_that_says_so():
+    worker = Worker(lambda _: ToySimulator(0.005))
+    worker.start(toy_trials(1), options(workers=2, evaluations=10000))
+    worker.events.get(timeout=PATIENCE)
+    os.kill(spawned(os.getpid(), 2)[0], signal.SIGKILL)
+    assert 'ended unexpectedly' in finished(worker)[-1].text
+
+
+def spawned(parent, count):
+    """Wait until a process has `count` spawned children, and return their ids."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < PATIENCE:
+        listing = subprocess.run(['ps', '--ppid', str(parent), '-o', 'pid=,args='], stdout=subprocess.PIPE)
+        lines = listing.stdout.decode().splitlines()
+        found = [int(line.split()[0]) for line in lines if 'spawn_main' in line]
+        if len(found) >= count:
+            return found
+        time.sleep(0.02)
+    raise AssertionError(f'no {count} processes')
+
+
+PROGRAM = """
+import sys, threading, time
+assert __name__ == '__main__', 'the main module was imported by a child'
+sys.modules['heavy'] = sys
+from dlo_calibration import pool
+
+executor = pool.process_executor(2)
+print(executor.submit(eval, "'heavy' in __import__('sys').modules").result(), flush=True)
+for _ in range(8):
+    executor.submit(time.sleep, 600)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def parent():
+    process = subprocess.Popen([sys.executable, '-c', PROGRAM], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    yield process
+    process.kill()
+    process.wait()
+
+
+def gone(pids):
+    begun = time.monotonic()
+    while time.monotonic() - begun < PATIENCE:
+        if not any(Path(f'/proc/{pid}').exists() for pid in pids):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_processes_do_not_import_the_main_module_and_end_with_a_killed_parent(parent):
+    assert parent.stdout.readline() == 'False\n'
+    children = spawned(parent.pid, 2)
+    parent.kill()
+    parent.wait()
+    assert gone(children)
+
+
+def test_processes_leave_signals_to_their_parent(parent):
+    parent.stdout.readline()
+    children = spawned(parent.pid, 2)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        for pid in children:
+            os.kill(pid, number)
+    time.sleep(0.3)
+    assert spawned(parent.pid, 2) == children
+
+
+def test_closing_a_pool_ends_what_is_under_way():
+    executor = pool.process_executor(2)
+    future = executor.submit(time.sleep, 10 * PATIENCE)
+    children = spawned(os.getpid(), 1)
+    pool.close(executor)
+    assert gone(children)
+    with pytest.raises(BaseException):  # noqa: B017 - cancelled or broken, but not waiting for ever
+        future.result(timeout=PATIENCE)
+
+
+def test_zero_workers_are_one_per_core():
+    executor = pool.process_executor(0)
+    try:
+        for _ in range(2 * pool.cores()):
+            executor.submit(time.sleep, 10 * PATIENCE)
+        assert len(spawned(os.getpid(), len(os.sched_getaffinity(0)))) == pool.cores()
+    finally:
+        pool.close(executor)
+
+
+def test_every_engine_that_can_be_chosen_exists():
+    assert set(ENGINES) == set(ENGINE_NAMES)
+
+
+def test_progress_tells_speed_and_time_left():
+    now = [100.0]
+    progress = Progress(10, 3, clock=lambda: now[0])
+    assert progress.seconds_left == float('inf')
+    worse, better = (Evaluation(k, np.zeros(1), {}, (score,)) for k, score in enumerate((5.0, 3.0)))
+    for evaluation in (worse, better, worse, worse):
+        progress.take(evaluation)
+    now[0] += 2.0
+    assert progress.best is better
+    assert progress.simulations_per_second == 6.0
+    assert progress.seconds_left == 3.0
+
+
+def test_worker_lives_in_a_thread_of_its_own():
+    threads = []
+    worker = Worker(lambda _: threads.append(threading.current_thread()) or ToySimulator())
+    worker.start(toy_trials(1), options(evaluations=1))
+    finished(worker)
+    assert threads[0] is not threading.current_thread()

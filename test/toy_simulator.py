@@ -1,0 +1,82 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""An analytic simulator: the points of a goal move linearly with the parameters on their 0..100 scale."""
+
+from __future__ import annotations
+
+import time
+from typing import Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration import Action, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError, Trial
+from dlo_calibration.calibration import mean_length
+from dlo_calibration.chain import Floats
+from dlo_calibration.parameters import BY_NAME
+
+REACH = 0.2  # m that a parameter moves the points that it moves most, from 0 to 100
+
+
+class ToySimulator:
+    """
+    Each parameter lifts the chain into another sine arch.
+
+    :param seconds: that one simulation lasts.
+    :param fail_below: a rollout diverges where flexibility is less than this (0..100).
+    :param crash: raise something that nobody expects.
+    """
+
+    name = 'toy'
+
+    def __init__(self, seconds: float = 0.0, fail_below: float = -1.0, crash: bool = False) -> None:
+        self.seconds = seconds
+        self.fail_below = fail_below
+        self.crash = crash
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """Return the goal chains of a trial, analytically."""
+        if self.seconds:
+            time.sleep(self.seconds)
+        if self.crash:
+            raise RuntimeError('the toy\nis broken')
+        if BY_NAME['flexibility'].value(physical['flexibility']) < self.fail_below:
+            raise SimulationError(f'{trial.name}: diverged')
+        chain = toy_goal(trial.initial.points, trial.hands, physical)
+        return Rollout(np.stack([chain] * len(trial.goals)), (True,) * len(trial.goals), 1.0, 200)
+
+    def close(self) -> None:
+        """Hold nothing."""
+
+
+def toy_goal(points: Floats, hands: Sequence[Hand], physical: Mapping[str, float]) -> Floats:
+    """Return where `points`, (n, 3) [m], go: with the hands, and into one arch per parameter."""
+    along = np.linspace(0, np.pi, len(points))
+    moved = points + np.mean([hand.positions[-1] - hand.positions[0] for hand in hands], axis=0)
+    for k, name in enumerate(('flexibility', 'elasticity', 'friction', 'self_collision')):
+        share = BY_NAME[name].value(physical[name]) / 100
+        moved[:, (2, 0, 1, 2)[k]] += REACH * share * np.sin((k + 1) * along)
+    return moved
+
+
+def toy_trial(values: Mapping[str, float], name: str = 'trial 1', n: int = 11, turn: float = 0.0) -> Trial:
+    """Return a trial whose goal is what the toy gives for `values`, all four on 0..100."""
+    along = np.linspace(0, 1, n)
+    initial = np.stack([along * np.cos(turn), along * np.sin(turn), np.zeros(n)], axis=1)
+    hand = Hand('left_hand', (0,), np.array([0.5, 1.5]), initial[0] + np.array([[0, 0, 0], [0, 0.1, 0.05]]))
+    draft = Trial(name, Chain(initial), (Action((hand,)),), (Goal(Chain(initial), 2.0),))
+    physical = ParameterSpace().physical(values, mean_length([draft]))
+    return Trial(name, draft.initial, draft.actions,
+                 (Goal(Chain(toy_goal(initial, draft.hands, physical)), 2.0),))
