@@ -1,0 +1,85 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Measure the engine's own error: reference objects with their true properties.
+
+    python benchmark/discretisation.py
+
+Nothing is fitted, and the chains are the noiseless ones, so what is left is the
+difference to the fine rod (101 nodes, 0.5 ms) that the objects were made with.
+The table is printed, and written to benchmark/results/discretisation.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from dlo_calibration import Action, Chain, Goal, Hand, Trial
+from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.parameters import PARAMETERS
+from dlo_calibration.score import PointErrors, residuals
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data')) / 'reference'
+#: nodes, time step [s], internal damping [s] (None: the default)
+CASES = ((31, 0.004, None), (31, 0.004, 0.004), (31, 0.008, None), (31, 0.002, None),
+         (61, 0.004, None), (61, 0.002, None), (61, 0.001, None))
+
+
+def exact_trials(name: str) -> tuple[dict[str, float], list[Trial]]:
+    """Return the properties and the nine noiseless trials of an object."""
+    document = json.loads((DATA / f'{name}.json').read_text())
+    trials = []
+    for one in document['trials']:
+        hands = tuple(Hand(f'hand{k}', (hand['grip_index'],), [knot['t'] for knot in hand['knots']],
+                           [knot['position'] for knot in hand['knots']])
+                      for k, hand in enumerate(one['hands']))
+        held = () if one['release'] else tuple(hand.name for hand in hands)
+        trials.append(Trial(one['action'], Chain(one['initial_exact']), (Action(hands),),
+                            (Goal(Chain(one['goal_exact']), one['goal_time'], held_by=held),)))
+    return document['properties'], trials
+
+
+def main() -> None:
+    """Make the table."""
+    objects = [exact_trials(f'object{k}') for k in range(1, 6)]
+    rows = ['| nodes | time step, ms | internal damping, ms | mean point error of 45 trials, mm | worst trial, mm |',
+            '|---|---|---|---|---|']
+    for nodes, step, damping in CASES:
+        simulator = BulletSimulator(nodes=nodes, time_step=step)
+        errors = []
+        for properties, trials in objects:
+            physical = {p.name: p.physical(p.default) for p in PARAMETERS}
+            physical.update(flexibility=properties['EI'], elasticity=properties['EA'], mass=properties['mass'],
+                            friction=properties['mu'], self_collision=properties['radius'])
+            if damping is not None:
+                physical['internal_damping'] = damping
+            errors += [PointErrors.of(residuals(trial, simulator.simulate(trial, physical).chains)).mean
+                       for trial in trials]
+        simulator.close()
+        rows.append(f'| {nodes} | {step * 1e3:g} | {physical["internal_damping"] * 1e3:.2g} '
+                    f'| {np.mean(errors) * 1e3:.2f} | {np.max(errors) * 1e3:.2f} |')
+        print(rows[-1], flush=True)
+    text = '# discretisation\n\n`python benchmark/discretisation.py`\n\n' + '\n'.join(rows) + '\n'
+    target = HERE / 'results' / 'discretisation.md'
+    target.parent.mkdir(exist_ok=True)
+    target.write_text(text)
+
+
+if __name__ == '__main__':
+    main()
