@@ -136,7 +136,8 @@ TABLES = {'reference': reference, 'mocap': mocap, 'hanging': hanging}
 
 def main() -> None:
     """Make the tables that were asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('tables', nargs='*', metavar='TABLE', help=', '.join(TABLES))
     parser.add_argument('--evaluations', default='150')
     parser.add_argument('--seed', default='1')

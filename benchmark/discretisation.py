@@ -28,11 +28,12 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
+
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
 from dlo_calibration.bullet import BulletSimulator
 from dlo_calibration.parameters import PARAMETERS
 from dlo_calibration.score import PointErrors, residuals
-import numpy as np
 
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data')) / 'reference'
@@ -58,15 +59,17 @@ def exact_trials(name: str) -> tuple[dict[str, float], list[Trial]]:
 def main() -> None:
     """Make the table."""
     objects = [exact_trials(f'object{k}') for k in range(1, 6)]
-    rows = ['| nodes | time step, ms | internal damping, ms | mean point error of 45 trials, mm | worst trial, mm |',
+    rows = ['| nodes | time step, ms | internal damping, ms | mean point error of 45 trials, mm '
+            '| worst trial, mm |',
             '|---|---|---|---|---|']
     for nodes, step, damping in CASES:
         simulator = BulletSimulator(nodes=nodes, time_step=step)
         errors = []
         for properties, trials in objects:
             physical = {p.name: p.physical(p.default) for p in PARAMETERS}
-            physical.update(flexibility=properties['EI'], elasticity=properties['EA'], mass=properties['mass'],
-                            friction=properties['mu'], self_collision=properties['radius'])
+            physical.update(flexibility=properties['EI'], elasticity=properties['EA'],
+                            friction=properties['mu'], self_collision=properties['radius'],
+                            mass=properties['mass'])
             if damping is not None:
                 physical['internal_damping'] = damping
             errors += [PointErrors.of(residuals(trial, simulator.simulate(trial, physical).chains)).mean

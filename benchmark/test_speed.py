@@ -38,5 +38,6 @@ def test_settled_rounds(benchmark, nodes):
     seconds = benchmark.stats.stats.median
     benchmark.extra_info['rounds per second'] = round(len(trials) / seconds, 1)
     benchmark.extra_info['microseconds per step'] = round(1e6 * seconds / steps, 1)
-    print(f'\n{nodes} nodes: {len(trials) / seconds:.1f} settled rounds/s, {1e6 * seconds / steps:.0f} us/step')
+    print(f'\n{nodes} nodes: {len(trials) / seconds:.1f} settled rounds/s, '
+          f'{1e6 * seconds / steps:.0f} us/step')
     simulator.close()

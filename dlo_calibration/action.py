@@ -75,7 +75,7 @@ class Hand:
         if (norms < 0.5).any():
             raise InputError(thing, f'a quaternion of length {norms.min():.2g}', 'a unit quaternion x y z w',
                              'use 0 0 0 1 for a hand that does not turn')
-        object.__setattr__(self, 'grips', tuple(int(g) for g in self.grips))
+        object.__setattr__(self, 'grips', tuple(dict.fromkeys(int(g) for g in self.grips)))
         object.__setattr__(self, 'times', times)
         object.__setattr__(self, 'positions', positions)
         object.__setattr__(self, 'orientations', frozen_array(orientations / norms))

@@ -13,20 +13,19 @@
 # limitations under the License.
 
 
-"""Messages: the wire contract to dataclasses and back; duck-typed, imports no rclpy."""
+"""Messages: chains and actions on the wire, to dataclasses and back; duck-typed, imports no rclpy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 import importlib
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.action import MAXIMUM_HANDS
-from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.errors import InputError
 
@@ -36,12 +35,6 @@ INPUT_TYPES: Mapping[str, str] = {
     ACTION: 'trajectory_msgs/msg/MultiDOFJointTrajectory',
     GOAL: 'sensor_msgs/msg/PointCloud2',
 }
-OUTPUT_TYPES: Mapping[str, str] = {
-    'progress': 'diagnostic_msgs/msg/DiagnosticArray',
-    'result': 'diagnostic_msgs/msg/DiagnosticArray',
-    'status': 'diagnostic_msgs/msg/DiagnosticArray',
-}
-STATES = ('collecting', 'calibrating', 'done', 'failed')
 
 NANOSECONDS = 10**9  # in a second
 MAXIMUM_POINTS = 10_000  # of a chain; a whole camera image sent by mistake has more
@@ -54,9 +47,6 @@ FIELD_TYPES = {INT8: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32'
 CODES = {UINT8: 'u1', FLOAT32: 'f4', FLOAT64: 'f8'}
 COORDINATES = ('x', 'y', 'z')
 ANNOTATIONS = ('hand', 'feature')
-OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
-VALUE_UNIT = '0..100'  # of value, std, lower and upper of a result
-WHOLE = 'calibration'  # name of the status that speaks of the whole result
 
 
 def named(kind: str, stamp: int) -> str:
@@ -381,102 +371,3 @@ def action_trajectory(types: MessageTypes, action: ActionMessage) -> Any:
                 'builtin_interfaces/msg/Duration', sec=seconds, nanosec=rest)))
     return types.build('trajectory_msgs/msg/MultiDOFJointTrajectory', points=points,
                        header=types.header(action.stamp, action.frame_id), joint_names=list(action.names))
-
-
-def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: Evaluation, evaluations: int,
-             simulations_per_second: float, seconds_left: float) -> Any:
-    """
-    Build the message about one finished evaluation.
-
-    :param evaluation: the one that has finished; counted from 1 in the message.
-    :param best: the best so far.
-    :param evaluations: how many there will be.
-    """
-    values: dict[str, Any] = {
-        'evaluation': evaluation.index + 1, 'evaluations': evaluations, 'score': evaluation.score,
-        'best_score': best.score, **{f'best_{name}': value for name, value in best.values.items()},
-        'simulations_per_second': simulations_per_second, 'seconds_left': seconds_left}
-    if evaluation.failure:
-        values['failure'] = evaluation.failure
-    message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {best.score:.1f}, '
-               f'{seconds_left:.0f} s left')
-    level = WARN if evaluation.failure else OK
-    return _diagnostics(types, stamp, [_status(types, level, 'progress', message, values)])
-
-
-def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
-    """Build the message with the final parameter set: one status per parameter, one for the whole."""
-    statuses = []
-    for name, p in found.parameters.items():
-        message = f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), {p.physical_value:.3g} {p.physical_unit}'
-        if not p.identifiable:
-            message += '; the trials could not tell it'
-        statuses.append(_status(types, OK if p.identifiable else WARN, name, message, {
-            'value': p.value, 'std': p.std, 'lower': p.lower, 'upper': p.upper, 'unit': VALUE_UNIT,
-            'physical_value': p.physical_value, 'physical_lower': p.physical_lower,
-            'physical_upper': p.physical_upper, 'physical_unit': p.physical_unit,
-            'identifiable': p.identifiable}))
-    errors = found.errors
-    statuses.append(_status(
-        types, WARN if found.warnings else OK, WHOLE,
-        f'score {found.best.score:.1f}, mean error {errors.mean * 1e3:.2f} mm; {found.stop_reason}', {
-            'score': found.best.score, 'scores': ' '.join(repr(float(s)) for s in found.best.scores),
-            'mean_error_mm': errors.mean * 1e3, 'rms_error_mm': errors.rms * 1e3,
-            'max_error_mm': errors.max * 1e3, 'mean_abs_error_mm': errors.mean_abs * 1e3,
-            'error_percent_of_length': 100 * errors.mean / found.length,
-            'trials': len(found.trials), 'evaluations': len(found.evaluations),
-            'simulations': found.simulations, 'seconds': found.seconds, 'engine': found.engine,
-            'search': found.search, 'seed': '' if found.seed is None else found.seed,
-            'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings)}))
-    return _diagnostics(types, stamp, statuses)
-
-
-def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
-    """Read the parameters of a `result` message: name -> key -> number, text or truth."""
-    found: dict[str, dict[str, float | str | bool]] = {}
-    for one in message.status:
-        if one.name != WHOLE:
-            values = {pair.key: pair.value for pair in one.values}
-            found[one.name] = {
-                key: value == 'true' if key == 'identifiable' else
-                value if key.endswith('unit') else float(value) for key, value in values.items()}
-    return found
-
-
-def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '') -> Any:
-    """
-    Build the message about what the node is doing.
-
-    :param state: one of STATES.
-    :param trials: number of complete trials.
-    :param last_refusal: text of the last refusal; empty where there was none.
-    :param incomplete: what the newest trial lacks; empty where nothing.
-    :param detail: of the state, e.g. why it failed.
-    """
-    if state not in STATES:
-        raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
-    message = f'{state}: {detail}' if detail else state
-    return _diagnostics(types, stamp, [_status(
-        types, ERROR if state == 'failed' else OK, 'status', message,
-        {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
-         'detail': detail})])
-
-
-def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:
-    return types.build('diagnostic_msgs/msg/DiagnosticArray', header=types.header(stamp),
-                       status=list(statuses))
-
-
-def _status(types: MessageTypes, level: int, name: str, message: str, values: Mapping[str, Any]) -> Any:
-    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=_text(value))
-             for key, value in values.items()]
-    return types.build('diagnostic_msgs/msg/DiagnosticStatus', level=types.level(level), name=name,
-                       message=message, hardware_id='', values=pairs)
-
-
-def _text(value: Any) -> str:
-    """Return text that reads back exactly."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -45,13 +45,14 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from dlo_calibration import messages
+from dlo_calibration import diagnostics, messages
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.collector import TrialCollector
 from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
-from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.recorder import Recorder
 from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
 
@@ -353,7 +354,7 @@ class CalibratorNode(Node):
         progress = self._progress
         if progress.newest is None or progress.best is None:
             return
-        self._send('progress', messages.progress(
+        self._send('progress', diagnostics.progress(
             self._types, stamp=self._now(), evaluation=progress.newest, best=progress.best,
             evaluations=progress.evaluations, simulations_per_second=progress.simulations_per_second,
             seconds_left=progress.seconds_left))
@@ -375,7 +376,7 @@ class CalibratorNode(Node):
                                f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
         for warning in event.warnings:
             self._warn(warning)
-        self._send('result', messages.result(self._types, event, self._now()))
+        self._send('result', diagnostics.result(self._types, event, self._now()))
         if options is not None:
             self._recorder.result(event, options)
         self._report()
@@ -389,12 +390,12 @@ class CalibratorNode(Node):
             'incomplete': self._collector.incomplete, 'detail': self._detail}
         if content != self._reported:
             self._reported = content
-            self._send('status', messages.status(self._types, stamp=self._now(), **content))
+            self._send('status', diagnostics.status(self._types, stamp=self._now(), **content))
 
     def _send(self, name: str, message: Any) -> None:
         octets = serialize_message(message)
+        self._record(name, OUTPUT_TYPES[name], octets)  # first: what anybody heard is on the disk
         self._outputs[name].publish(octets)
-        self._record(name, OUTPUT_TYPES[name], octets)
 
     def _record(self, name: str, kind: str, octets: bytes) -> None:
         """Record a message under the node's own name for its topic, whatever that is remapped to."""

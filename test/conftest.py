@@ -20,6 +20,7 @@ import os
 import socket
 
 import pytest
+from wire import SOURCES
 
 # Above 101 the ports of a domain fall into the range that Linux gives to any program.
 # https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html
@@ -54,3 +55,9 @@ def ros_environment(monkeypatch: pytest.MonkeyPatch, tmp_path) -> Mapping[str, s
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
     monkeypatch.delenv('ROS_STATIC_PEERS', raising=False)
     return dict(os.environ)
+
+
+@pytest.fixture(params=SOURCES)
+def types(request):
+    """Give the message classes of either source."""
+    return SOURCES[request.param]()

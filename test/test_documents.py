@@ -20,7 +20,7 @@ import re
 import pytest
 
 from dlo_calibration.config import declarations
-from dlo_calibration.messages import OUTPUT_TYPES
+from dlo_calibration.diagnostics import OUTPUT_TYPES
 
 ROOT = Path(__file__).resolve().parent.parent
 

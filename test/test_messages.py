@@ -23,32 +23,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from wire import SOURCES, wire
 
 from dlo_calibration import messages
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.calibration import CalibrationResult, Evaluation, ParameterEstimate
 from dlo_calibration.chain import Chain
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import ACTION, ActionMessage, GOAL, INITIAL, read
-from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.score import PointErrors
-from dlo_calibration.trial import Goal, Trial
 
 STAMP = 12_500_000_000
 SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
-
-
-def graph_types():
-    pytest.importorskip('sensor_msgs.msg', reason='the message classes of ROS 2 are not installed')
-    return messages.rclpy_types()
-
-
-SOURCES = {'rosbags': messages.bag_types, 'rclpy': graph_types}
-
-
-@pytest.fixture(params=SOURCES)
-def types(request):
-    return SOURCES[request.param]()
 
 
 def curve(count=21, length=1.0):
@@ -292,116 +275,15 @@ def test_action_of_nine_hands_is_refused(types):
     assert '9 joint_names, expected 1 to 8' in refusal(ACTION, nine)
 
 
-# ---- writing diagnostics
-
-def found_result(**changes):
-    estimates = {
-        'flexibility': ParameterEstimate('flexibility', 100 / 3, 0.1 + 0.2, 30.0, 36.5, 1e-3 / 7, 1e-5, 2e-3,
-                                         'N m^2 per N/m', True),
-        'friction': ParameterEstimate('friction', 50.0, 28.9, 0.0, 100.0, 0.14, 0.01, 2.0, '1', False)}
-    best = Evaluation(1, np.array([1 / 3, 0.5]), {'flexibility': 100 / 3, 'friction': 50.0}, (40.5, 20.25),
-                      PointErrors(0.002, 0.003, 0.01, 0.001), np.zeros(3))
-    chain = Chain([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    trial = Trial('trial 1', chain, (Action((Hand('left_hand', (0,), [0.0], [[0, 0, 0]]),)),),
-                  (Goal(chain, 1.0),))
-    return replace(CalibrationResult(
-        ParameterSpace(('flexibility', 'friction')), estimates, best, (trial, trial), (), (best, best, best),
-        9.1, 'random', 'bullet', 'budget of 3 evaluations spent', 7, ('one', 'two')), **changes)
-
-
-def by_name(message):
-    return {one.name: (one, {pair.key: pair.value for pair in one.values}) for one in message.status}
-
-
-def test_result_tells_every_parameter_exactly(types):
-    found = found_result()
-    message = messages.result(types, found, STAMP)
-    values = messages.result_values(message)
-    assert list(values) == ['flexibility', 'friction']
-    for name, estimate in found.parameters.items():
-        assert list(values[name]) == [
-            'value', 'std', 'lower', 'upper', 'unit', 'physical_value', 'physical_lower', 'physical_upper',
-            'physical_unit', 'identifiable']
-        for key, value in values[name].items():
-            assert value == ('0..100' if key == 'unit' else getattr(estimate, key))
-    levels = {name: one.level for name, (one, _) in by_name(message).items()}
-    assert levels['flexibility'] == types.level(0)
-    assert levels['friction'] == types.level(1)
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
-
-
-def test_result_tells_the_whole(types):
-    one, values = by_name(messages.result(types, found_result(), STAMP))['calibration']
-    assert values.pop('seconds') == '9.1'
-    assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
-    assert float(values.pop('error_percent_of_length')) == pytest.approx(0.1)
-    for key, millimetres in (('mean', 2), ('rms', 3), ('max', 10), ('mean_abs', 1)):
-        assert float(values.pop(f'{key}_error_mm')) == pytest.approx(millimetres)
-    assert values == {
-        'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
-        'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent',
-        'warnings': 'one; two'}
-    assert one.level == types.level(1)
-    one, values = by_name(messages.result(types, found_result(warnings=(), seed=None), STAMP))['calibration']
-    assert one.level == types.level(0)
-    assert (values['seed'], values['warnings']) == ('', '')
-
-
-def test_progress_tells_the_best_so_far_and_what_is_left(types):
-    best = Evaluation(0, np.array([0.25]), {'friction': 25.0}, (12.0,))
-    failed = Evaluation(4, np.array([0.5]), {'friction': 50.0}, failure='diverged')
-    one, values = by_name(messages.progress(
-        types, stamp=STAMP, evaluation=failed, best=best, evaluations=150, simulations_per_second=31.5,
-        seconds_left=4.6))['progress']
-    assert values == {'evaluation': '5', 'evaluations': '150', 'score': 'inf', 'best_score': '12.0',
-                      'best_friction': '25.0', 'simulations_per_second': '31.5', 'seconds_left': '4.6',
-                      'failure': 'diverged'}
-    assert one.message == 'evaluation 5 of 150, best score 12.0, 5 s left'
-    assert one.level == types.level(1)
-
-
-@pytest.mark.parametrize(('state', 'level'), [
-    ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
-def test_status_tells_state_trials_and_refusal(types, state, level):
-    one, values = by_name(messages.status(
-        types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why'
-    ))['status']
-    assert values == {'state': state, 'trials': '3', 'last_refusal': 'too few', 'incomplete': 'a goal',
-                      'detail': 'why'}
-    assert one.message == f'{state}: why'
-    assert one.level == types.level(level)
-
-
-def test_status_knows_four_states(types):
-    with pytest.raises(ValueError, match='sleeping'):
-        messages.status(types, stamp=STAMP, state='sleeping', trials=0)
-
-
 def test_written_messages_cross_the_wire(types):
     """All that is written can be serialised and comes back as it was."""
-    if isinstance(types.octets(b''), np.ndarray):
-        from rosbags.typesys import get_typestore, Stores
-        store = get_typestore(Stores.ROS2_JAZZY)
-
-        def travel(message):
-            name = message.__msgtype__
-            return store.deserialize_cdr(store.serialize_cdr(message, name), name)
-    else:
-        serialization = pytest.importorskip('rclpy.serialization', reason='ROS 2 is not installed')
-
-        def travel(message):
-            return serialization.deserialize_message(serialization.serialize_message(message), type(message))
-
+    travel = wire(types)
     chain = Chain(curve(), np.arange(21) % 2, np.arange(21) == 4)
     found = read(INITIAL, travel(messages.chain_cloud(types, chain, STAMP, 'world')))
     np.testing.assert_array_equal(found.chain.points, chain.points)
     np.testing.assert_array_equal(found.chain.hands, chain.hands)
     np.testing.assert_array_equal(
         read(ACTION, travel(messages.action_trajectory(types, action()))).positions, action().positions)
-    values = messages.result_values(travel(messages.result(types, found_result(), STAMP)))
-    assert values['flexibility']['value'] == 100 / 3
-    report = travel(messages.status(types, stamp=STAMP, state='failed', trials=0, detail='why'))
-    assert report.status[0].level == types.level(2)
 
 
 def test_module_loads_no_message_package():

@@ -31,7 +31,8 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import cli, InputError
 from dlo_calibration.config import declarations, Options
-from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types, result_values
+from dlo_calibration.diagnostics import result_values
+from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
 from dlo_calibration.session import read_session
 from dlo_calibration.xml import read_result
 
