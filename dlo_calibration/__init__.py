@@ -12,18 +12,46 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Find the physical parameters of a rope, cable, wire or hose from observed manipulations."""
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
-from dlo_calibration.chain import Chain
-from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.parameters import Parameter, PARAMETERS, ParameterSpace
-from dlo_calibration.simulator import Rollout, Simulator
-from dlo_calibration.trial import Goal, Trial
+"""
+Find the physical parameters of a rope, cable, wire or hose from observed manipulations.
+
+Names are imported when they are first used, so that a program which starts from
+this package, such as the node, can listen to signals before NumPy is loaded.
+"""
+
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dlo_calibration.action import Action, Hand
+    from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
+    from dlo_calibration.chain import Chain
+    from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+    from dlo_calibration.parameters import Parameter, PARAMETERS, ParameterSpace
+    from dlo_calibration.simulator import Rollout, Simulator
+    from dlo_calibration.trial import Goal, Trial
 
 __all__ = [
     'PARAMETERS', 'Action', 'CalibrationResult', 'Chain', 'DloCalibrationError', 'Evaluation', 'Goal',
     'Hand', 'InputError', 'Parameter', 'ParameterSpace', 'Rollout', 'SimulationError', 'Simulator',
     'Trial', 'calibrate',
 ]
+
+_HOMES = {
+    'action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult', 'Evaluation'),
+    'chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
+    'parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulator': ('Rollout', 'Simulator'),
+    'trial': ('Goal', 'Trial'),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f'{__name__}.{_HOME[name]}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -22,10 +22,11 @@ itself, and Bullet does contact and friction with everything else.
 
 from __future__ import annotations
 
-from typing import Any, Mapping, Sequence
+from contextlib import contextmanager
+import os
+from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
-import pybullet
 
 from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.contact import SelfContact
@@ -35,6 +36,23 @@ from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.simulator import Rollout
 from dlo_calibration.trial import Trial
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep native code from writing to stderr."""
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
+
+
+with _silence():  # it greets every process with its build time, in the middle of a progress bar
+    import pybullet
 
 DEFAULT_NODES = 31
 DEFAULT_TIME_STEP = 0.004  # s

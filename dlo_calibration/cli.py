@@ -42,7 +42,7 @@ PROGRAM = 'dlo-calibration'
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' convention
 #: Options that say what was observed, not how it is simulated.
 OF_THE_SESSION = ('table', 'table_height', 'grip_tolerance', 'length_tolerance', 'release')
-RESULT, SESSION, REPORT = 'result.xml', 'session.mcap', 'report.html'
+RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
 
 
 def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         added.add_argument('--json', action='store_true', help='print one JSON document')
         _add_options(added)
     fit.add_argument('--output', metavar='DIR', type=Path,
-                     help=f'write {RESULT}, {SESSION} and {REPORT} there')
+                     help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} there')
     return parser
 
 
@@ -201,7 +201,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                 raise KeyboardInterrupt from None
         if folder is not None:
             _write(folder, chosen.session, found, result)
-            _note(f'{RESULT}, {SESSION} and {REPORT} are in {folder}')
+            _note(f'{RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} are in {folder}')
         _print_result(result, chosen.json)
     return 0
 
@@ -286,7 +286,7 @@ def _print_result(result: CalibrationResult, as_json: bool) -> None:
 def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (RESULT, SESSION, REPORT):
+        for name in (RESULT, SESSION, REPORT, EVALUATIONS):
             with (folder / name).open('ab'):
                 pass
     except OSError as error:
@@ -296,10 +296,11 @@ def _make_folder(folder: Path) -> None:
 
 def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult) -> None:
     """Write the three files of `fit`."""
-    from dlo_calibration.report import write_report
+    from dlo_calibration.report import write_evaluations, write_report
 
     write_result(folder / RESULT, result, found.options.flat())
     _write_session(folder / SESSION, source, found)
+    write_evaluations(folder / EVALUATIONS, result)
     flags = [flag for name, value in found.options.flat().items() if value != Options().flat()[name]
              for flag in _as_flags(name, value)]
     command = ' '.join([PROGRAM, 'fit', SESSION, *flags])

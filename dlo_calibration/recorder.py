@@ -25,6 +25,7 @@ from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.recording import RecordingError, SessionWriter
+from dlo_calibration.report import write_evaluations
 from dlo_calibration.xml import write_result
 
 
@@ -63,10 +64,11 @@ class Recorder:
         self._write(lambda session: session.write_mark('start'))
 
     def result(self, result: CalibrationResult, options: Options) -> None:
-        """Write result.xml (result_2.xml, ...) into the session's folder."""
+        """Write result.xml and evaluations.csv (result_2.xml, ...) into the session's folder."""
         if self._session is not None:
             try:
                 write_result(_free(self._session.path, 'result', '.xml'), result, options.flat())
+                write_evaluations(_free(self._session.path, 'evaluations', '.csv'), result)
             except InputError as error:
                 self._on_failure(str(error))
 

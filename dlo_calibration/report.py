@@ -13,11 +13,12 @@
 # limitations under the License.
 
 
-"""Report: what a calibration found, as one HTML page that needs nothing else."""
+"""Report: what a calibration found, as one HTML page; and all that it tried, as a table."""
 
 from __future__ import annotations
 
 import base64
+import csv
 from html import escape
 from pathlib import Path
 from typing import Iterable, Sequence
@@ -61,6 +62,29 @@ def write_report(path: Path, result: CalibrationResult, command: str, problems: 
         + f'<h2>To repeat it</h2><p><code>{escape(command)}</code></p></body></html>\n')
     try:
         path.write_text(page, encoding='utf-8')
+    except OSError as error:
+        raise InputError(f'file {path}', str(error), 'a place that can be written to',
+                         'choose another one with --output') from error
+
+
+def write_evaluations(path: Path, result: CalibrationResult) -> None:
+    """
+    Write every evaluation as a row of a CSV file: parameters (0..100), scores [cm], error [m].
+
+    :raises InputError: where the file cannot be written.
+    """
+    names = result.space.free
+    trials = [trial.name for trial in result.trials]
+    try:
+        with path.open('w', newline='', encoding='utf-8') as stream:
+            rows = csv.writer(stream)
+            rows.writerow(['evaluation', *names, 'score', *(f'score of {name}' for name in trials),
+                           'mean_error_m', 'failure'])
+            for one in result.evaluations:
+                scores = one.scores or [''] * len(trials)
+                error = '' if one.errors is None else one.errors.mean
+                rows.writerow([one.index + 1, *(one.values[name] for name in names), one.score, *scores,
+                               error, one.failure])
     except OSError as error:
         raise InputError(f'file {path}', str(error), 'a place that can be written to',
                          'choose another one with --output') from error

@@ -15,6 +15,7 @@
 
 """The command line: what it prints, where, and how it ends."""
 
+import csv
 import json
 import math
 import os
@@ -112,13 +113,20 @@ def test_fit_for_people_has_both_units_and_says_what_is_not_identifiable(run, se
 def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_path):
     folder = tmp_path / 'new' / 'out'
     first = only_json(run('fit', session, '--json', '--output', folder, '--evaluations', 8)[1])
-    assert {file.name for file in folder.iterdir()} == {'result.xml', 'session.mcap', 'report.html'}
+    assert {file.name for file in folder.iterdir()} == {
+        'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'}
     again = only_json(run('fit', folder / 'session.mcap', '--json', '--evaluations', 8)[1])
     assert again['parameters'] == first['parameters']
     report = (folder / 'report.html').read_text()
     assert report.count('data:image/png;base64,') == 2
     assert '--evaluations 8' in report
     assert not re.search('(src|href)="(?!data:)', report)  # it needs nothing else
+    with (folder / 'evaluations.csv').open(newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row['evaluation'] for row in rows] == [str(k) for k in range(1, 9)]
+    best = min(rows, key=lambda row: float(row['score']))
+    assert float(best['score']) == first['score']
+    assert float(best['friction']) == first['parameters']['friction']['value']
 
 
 def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
