@@ -35,6 +35,7 @@ ITERATIONS = 10
 PUSH_OUT = 0.8  # share of a penetration that one step removes
 FASTEST_PUSH_OUT = 0.8  # m/s, so that nothing is kicked
 SUPPORTED = 0.5  # cosine between a push and the support against it
+UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding
 WEDGED = 0.1  # a pair of which less than that share can yield is wedged: then all of it does
 TINY = 1e-12
 
@@ -126,7 +127,8 @@ class SelfContact:
         nodes, weights, normal, wanted = nodes[near], weights[near], normal[near], wanted[near]
         sharing = np.bincount(nodes.ravel(), minlength=len(points))
         backing = np.einsum('ckj,cj->ck', support[nodes], normal) * np.sign(weights)
-        yielding = inverse_masses[nodes] * (backing > -SUPPORTED * np.linalg.norm(support[nodes], axis=2))
+        resistance = np.maximum(SUPPORTED * np.linalg.norm(support[nodes], axis=2), UNSUPPORTED)
+        yielding = inverse_masses[nodes] * (backing > -resistance)
         wedged = np.einsum('ck,ck->c', weights**2, yielding) < WEDGED * np.einsum(
             'ck,ck->c', weights**2, inverse_masses[nodes])
         yielding = np.where(wedged[:, None], inverse_masses[nodes], yielding)

@@ -80,7 +80,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('damping', 'drag per mass', '1/s', 1e-2, 1e2, 50.0,
               'how fast motion through the air dies out'),
     Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-5, 1e-1, 25.0,
-              'how fast bending and stretching vibrations die out'),
+              'how fast bending and stretching vibrations die out (0.6 time steps at least)'),
     Parameter('mass', 'mass of the whole DLO', 'kg', 1e-3, 1e1, 42.0, 'mass of the whole DLO'),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}

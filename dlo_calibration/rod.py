@@ -72,16 +72,14 @@ class RodProperties:
 
 class Rod:
     """
-    A chain of N nodes whose velocities are stepped by its internal forces and gravity.
+    A chain of N nodes, straight at rest, whose velocities are stepped by its internal forces and gravity.
 
     :param rest_lengths: (N - 1,) [m] of the segments; they need not be equal.
     :param properties: see `RodProperties`.
     :param time_step: [s].
-    :param rest_points: (N, 3) [m] shape in which bending is without force; None: straight.
     """
 
-    def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
-                 rest_points: Floats | None = None) -> None:
+    def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float) -> None:
         n = len(rest_lengths) + 1
         self._rest = rest_lengths
         self._step = time_step
@@ -92,7 +90,6 @@ class Rod:
         #: (N,) mass of each node [kg]
         self.masses = properties.mass * weights / weights.sum()
         self._properties = properties
-        self._rest_points = np.zeros((n, 3)) if rest_points is None else rest_points
         self._implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
         self._places, self._signs = _stretching_places(n)
         self.hold(())
@@ -109,7 +106,6 @@ class Rod:
         held = np.isin(np.arange(len(self.masses)), self._held)
         rigid = held[:-1] & held[1:]
         self._bending = _bending_bands(self._rest, rigid, self._properties.bending_stiffness)
-        self._rest_force = self._bend(self._rest_points)
         self._constant = np.zeros((BANDS, len(self.masses), 3))
         self._constant[0] = (self.masses * (1 + self._properties.drag * self._step))[:, None]
         for offset in range(3):
@@ -137,7 +133,7 @@ class Rod:
         lengths = np.sqrt(squares)
         slack = (1 - self._rest / lengths)[:, None]
         tensions = self._stiffness * slack * segments
-        forces = self._rest_force - self._bend(points)
+        forces = -self._bend(points)
         forces[:-1] += tensions
         forces[1:] -= tensions
         right = self.masses[:, None] * (velocities + step * gravity) + step * forces

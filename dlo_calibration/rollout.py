@@ -98,6 +98,8 @@ class _Course:
         self._settling = settling
         self._time = 0.0  # of the trial
         self._steps = 0
+        self._last = stepper.points, 0.0  # the points one step ago, and when that was
+        self._ahead = trial.goals  # the goal under way and those after it
         self._grips: dict[str, _Grip] = {}
         self._waiting = sorted(trial.hands, key=lambda hand: hand.start)
         self._hold()
@@ -105,12 +107,14 @@ class _Course:
     def rollout(self) -> Rollout:
         """Go from goal to goal."""
         chains, settled = [], []
-        for goal in self._trial.goals:
+        for k, goal in enumerate(self._trial.goals):
+            self._ahead = self._trial.goals[k:]
             if goal.stable:
                 self._act_until(goal.time)
                 self._open(goal)
+                now = self._time
                 settled.append(self._settle(self._settling.limit))
-                self._time = max(self._time, goal.time)
+                self._time = now  # waiting takes no time of the trial
                 chains.append(self._observed(self._stepper.points))
             else:
                 chains.append(self._observed(self._points_at(goal.time)))
@@ -125,9 +129,9 @@ class _Course:
         """Go on to an instant; between two steps, interpolate."""
         step = self._stepper.time_step
         self._act_until(instant - step)
-        before, start = self._stepper.points, self._time
+        before, start = self._last
         while self._time < instant - ROUNDING:
-            before, start = self._stepper.points, self._time
+            before, start = self._last = self._stepper.points, self._time
             self._close()
             self._advance(1)
             self._open_arrived()
@@ -163,6 +167,8 @@ class _Course:
             positions, turns = hand.poses(self._time + step * np.arange(count + 1))
             offsets = self._stepper.points[list(nodes)] - positions[0]
             path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:] @ turns[0].T, offsets)
+            self._grips.pop(hand.name, None)
+            self._let_go(nodes)
             self._grips[hand.name] = _Grip(hand, nodes, self._steps, path)
         if closing:
             self._hold()
@@ -171,7 +177,7 @@ class _Course:
         """Open the hands that have arrived, unless the next goal shows them holding."""
         for grip in list(self._grips.values()):
             if grip.hand.end <= self._time + ROUNDING:
-                following = [goal for goal in self._trial.goals if goal.time > grip.hand.end]
+                following = [goal for goal in self._ahead if goal.time > grip.hand.end]
                 if following and not self._trial.holds(grip.hand, following[0]):
                     self._release(grip)
 
@@ -180,6 +186,15 @@ class _Course:
         for grip in list(self._grips.values()):
             if grip.hand.end < goal.time and not self._trial.holds(grip.hand, goal):
                 self._release(grip)
+
+    def _let_go(self, nodes: tuple[int, ...]) -> None:
+        """Take nodes from the hands that hold them: another hand takes over."""
+        for name, grip in list(self._grips.items()):
+            kept = [k for k, node in enumerate(grip.nodes) if node not in nodes]
+            if not kept:
+                del self._grips[name]
+            elif len(kept) < len(grip.nodes):
+                grip.nodes, grip.path = tuple(grip.nodes[k] for k in kept), grip.path[:, kept]
 
     def _release(self, grip: _Grip) -> None:
         del self._grips[grip.hand.name]

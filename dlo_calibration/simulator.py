@@ -19,7 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Mapping, Protocol
 
+import numpy as np
+
 from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.trial import Trial
 
 
@@ -33,6 +36,7 @@ class Rollout:
         DLO had not come to rest within the time limit; it is compared as it was.
     :param duration: simulated time [s].
     :param steps: time steps taken.
+    :raises SimulationError: where a point is not finite.
     """
 
     chains: Floats
@@ -41,7 +45,10 @@ class Rollout:
     steps: int
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'chains', frozen_array(self.chains))
+        chains = frozen_array(self.chains)
+        if not np.isfinite(chains).all():
+            raise SimulationError('the rollout diverged: a simulated point is not finite')
+        object.__setattr__(self, 'chains', chains)
 
 
 class Simulator(Protocol):

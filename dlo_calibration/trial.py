@@ -77,6 +77,11 @@ class Trial:
                     'resample both chains to the same material points')
         for action in actions:
             for hand in action.hands:
+                moving = [goal for goal in goals if goal.stable and hand.start < goal.time < hand.end]
+                if moving:
+                    raise InputError(
+                        thing, f'a stable goal at {moving[0].time:g} s, while hand {hand.name!r} moves',
+                        'a goal after its last waypoint', 'make it a timed goal')
                 if not all(0 <= grip < n for grip in hand.grips):
                     raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
                                      f'points 0 to {n - 1}', 'correct the gripped points')

@@ -37,6 +37,7 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
+from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import (
     ACTION,
@@ -48,7 +49,6 @@ from dlo_calibration.messages import (
     INITIAL,
     INPUT_TYPES,
     read,
-    status,
 )
 from dlo_calibration.session import encode, read_session, RecordingError, session_trials, SessionWriter
 

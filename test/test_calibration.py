@@ -1,0 +1,300 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The calibration loop on an analytic simulator: what it finds, in what order, and how it ends."""
+
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+from toy_simulator import toy_trial, ToySimulator
+
+from dlo_calibration import (
+    calibrate,
+    Goal,
+    InputError,
+    ParameterSpace,
+    Rollout,
+    SimulationError,
+    Trial,
+)
+from dlo_calibration.search import SEARCHES
+
+TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
+TRIALS = (toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=1.0))
+
+
+def search(space=None, seed=1, name='random'):
+    return SEARCHES[name]((space or ParameterSpace()).dimension, seed)
+
+
+def found(trials=TRIALS, space=None, simulator=None, seed=1, **rest):
+    space = space or ParameterSpace()
+    return calibrate(trials, space, simulator or ToySimulator(), search(space, seed), seed=seed, **rest)
+
+
+@pytest.mark.parametrize('name', TRUTH)
+def test_a_single_parameter_is_recovered(name):
+    space = ParameterSpace((name,), {other: value for other, value in TRUTH.items() if other != name})
+    result = found(space=space)
+    estimate = result.parameters[name]
+    # 150 random values lie less than 3 from anywhere, but for one seed in a hundred.
+    assert estimate.value == pytest.approx(TRUTH[name], abs=3)
+    assert estimate.identifiable
+    assert estimate.lower <= estimate.value <= estimate.upper
+    assert result.errors.max < 0.03 * 0.2
+    assert result.best.score < 10
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_four_parameters_together_score_better_than_almost_any(seed):
+    result = found(seed=seed)
+    scores = [evaluation.score for evaluation in result.evaluations]
+    assert result.best.score == min(scores)
+    assert result.best.score < 0.4 * np.median(scores)
+    exact = ToySimulator().simulate(TRIALS[0], ParameterSpace().physical(TRUTH, result.length)).chains
+    assert exact == pytest.approx(np.stack([goal.chain.points for goal in TRIALS[0].goals]), abs=1e-9)
+
+
+def test_a_parameter_without_effect_is_not_identifiable():
+    space = ParameterSpace(('flexibility', 'damping'), {k: v for k, v in TRUTH.items() if k != 'flexibility'})
+    result = found(space=space)
+    assert result.parameters['flexibility'].identifiable
+    assert not result.parameters['damping'].identifiable
+
+
+def test_physical_values_beside_the_scale():
+    result = found(space=ParameterSpace(mass=0.05), budget=30)
+    for name, estimate in result.parameters.items():
+        physical = result.space.physical(result.values, result.length)[name]
+        assert estimate.physical_value == pytest.approx(physical)
+        assert estimate.physical_lower <= estimate.physical_value <= estimate.physical_upper
+    assert result.parameters['flexibility'].physical_unit == 'N m^2'
+    assert result.physical()['mass'] == 0.05
+    assert found(budget=2).parameters['flexibility'].physical_unit == 'N m^2 per N/m'
+
+
+def test_every_evaluation_is_kept_and_reported_in_order():
+    seen = []
+    result = found(budget=120, on_evaluation=seen.append)
+    assert [evaluation.index for evaluation in seen] == list(range(120))
+    assert [evaluation.index for evaluation in result.evaluations] == list(range(120))
+    assert [e.scores for e in result.evaluations] == [e.scores for e in seen]
+    assert all(len(e.scores) == 2 for e in seen)
+    assert result.simulations == 240
+
+
+def test_residuals_are_kept_of_the_best_only():
+    result = found(budget=20)
+    assert all(evaluation.residuals is None for evaluation in result.evaluations)
+    assert result.best.residuals.shape == (2 * 11 * 3,)
+    assert result.evaluations[result.best.index].point.tolist() == result.best.point.tolist()
+
+
+def test_the_chains_are_those_that_the_simulator_gives_for_the_best():
+    result = found(budget=20)
+    assert result.values == result.best.values
+    for trial, chains in zip(TRIALS, result.chains, strict=True):
+        assert chains == pytest.approx(ToySimulator().simulate(trial, result.physical()).chains, abs=1e-12)
+
+
+@pytest.mark.parametrize('budget', [1, 2, 77])
+def test_the_budget_is_spent_and_not_more(budget):
+    result = found(budget=budget)
+    assert len(result.evaluations) == budget
+    assert result.stop_reason == f'budget of {budget} evaluations spent'
+
+
+def test_the_record_says_how_it_was_found():
+    ticks = iter([10.0, 17.5])
+    result = calibrate(TRIALS, ParameterSpace(), ToySimulator(), search(seed=7), budget=3, seed=7,
+                       clock=lambda: next(ticks))
+    assert (result.seed, result.engine, result.search, result.seconds) == (7, 'toy', 'random', 7.5)
+    assert result.trials == TRIALS
+    assert result.warnings == ()
+
+
+def test_a_search_that_finishes_early_says_why():
+    class Finished:
+        name = 'finished'
+        stop_reason = 'it cannot get better'
+
+        def __init__(self):
+            self.told = []
+
+        def ask(self, limit):
+            return np.full((2 if not self.told else 0, 4), 0.5)
+
+        def tell(self, observations):
+            self.told += observations
+
+    finished = Finished()
+    result = calibrate(TRIALS, ParameterSpace(), ToySimulator(), finished)
+    assert len(result.evaluations) == 2
+    assert result.stop_reason == 'it cannot get better'
+    assert [one.score for one in finished.told] == [evaluation.score for evaluation in result.evaluations]
+    assert all(one.residuals.shape == (66,) for one in finished.told)
+
+
+def stop_after(simulations):
+    """Return a simulator and a `should_stop` that becomes true once that many trials were simulated."""
+    simulator = ToySimulator()
+    simulate, done = simulator.simulate, []
+
+    def counting(trial, physical):
+        done.append(trial.name)
+        return simulate(trial, physical)
+
+    simulator.simulate = counting
+    return simulator, lambda: len(done) >= simulations
+
+
+def test_a_stop_between_trials_gives_the_best_so_far():
+    seen = []
+    simulator, should_stop = stop_after(11)  # in the middle of the sixth evaluation
+    result = found(simulator=simulator, should_stop=should_stop, on_evaluation=seen.append)
+    assert len(result.evaluations) == len(seen) == 5
+    assert result.best.score == min(evaluation.score for evaluation in seen)
+    assert result.stop_reason == 'stopped on request'
+    assert result.evaluations[-1].scores == found(budget=5).evaluations[-1].scores
+
+
+def test_a_stop_before_anything_is_known_is_no_result():
+    with pytest.raises(SimulationError, match='stopped before the first evaluation had finished'):
+        found(should_stop=lambda: True)
+    with ThreadPoolExecutor(2) as executor, pytest.raises(SimulationError, match='stopped before the first'):
+        found(should_stop=lambda: True, executor=executor)
+
+
+def test_failed_evaluations_are_kept_with_their_reason():
+    seen = []
+    result = found(simulator=ToySimulator(fail_below=30.0), budget=60, on_evaluation=seen.append)
+    failed = [evaluation for evaluation in result.evaluations if evaluation.failure]
+    assert 0 < len(failed) < 60
+    assert len(seen) == 60
+    for evaluation in failed:
+        assert evaluation.values['flexibility'] < 30
+        assert evaluation.failure == 'trial 1: diverged'
+        assert evaluation.score == float('inf')
+        assert evaluation.errors is None
+    assert result.best.values['flexibility'] >= 30
+    assert result.warnings == (
+        f'{len(failed)} of 60 evaluations could not be simulated: trial 1: diverged',)
+
+
+def test_where_all_fail_there_is_no_result_but_a_reason():
+    with pytest.raises(SimulationError, match='none of 12 evaluations could be simulated: trial 1: diverged'):
+        found(simulator=ToySimulator(fail_below=101.0), budget=12)
+
+
+class Shaky(ToySimulator):
+    """It never comes to rest in the second trial."""
+
+    def simulate(self, trial, physical):
+        rollout = super().simulate(trial, physical)
+        settled = tuple(trial.name != 'trial 2' for _ in rollout.settled)
+        return Rollout(rollout.chains, settled, rollout.duration, rollout.steps)
+
+
+def test_a_trial_that_never_settles_is_named_in_a_warning():
+    result = found(simulator=Shaky(), budget=3)
+    assert result.best.unsettled == ('trial 2',)
+    assert len(result.warnings) == 1
+    assert 'never came to rest: trial 2' in result.warnings[0]
+
+
+class NotFinite(ToySimulator):
+    """It diverges in its first simulations, and does not notice."""
+
+    def __init__(self):
+        super().__init__()
+        self.left = 4
+
+    def simulate(self, trial, physical):
+        rollout = super().simulate(trial, physical)
+        self.left -= 1
+        chains = rollout.chains * (np.nan if self.left >= 0 else 1)
+        return Rollout(chains, rollout.settled, rollout.duration, rollout.steps)
+
+
+def test_a_rollout_that_is_not_finite_is_a_failure_and_never_wins():
+    result = found(simulator=NotFinite(), budget=10)
+    assert np.isfinite(result.best.score)
+    assert [bool(evaluation.failure) for evaluation in result.evaluations] == [True] * 4 + [False] * 6
+
+
+def test_an_error_that_nobody_expects_is_not_hidden():
+    with pytest.raises(RuntimeError, match='the toy'):
+        found(simulator=ToySimulator(crash=True))
+    with ThreadPoolExecutor(2) as executor, pytest.raises(RuntimeError, match='the toy'):
+        found(simulator=ToySimulator(crash=True), executor=executor)
+
+
+def test_without_trials_there_is_nothing_to_calibrate():
+    with pytest.raises(InputError, match='no trials, expected at least one complete trial; record'):
+        found(trials=())
+
+
+def same(first, second):
+    """Compare two results bit for bit, all but the time they took."""
+    assert [e.point.tobytes() for e in first.evaluations] == [e.point.tobytes() for e in second.evaluations]
+    assert [e.scores for e in first.evaluations] == [e.scores for e in second.evaluations]
+    assert [e.failure for e in first.evaluations] == [e.failure for e in second.evaluations]
+    assert first.parameters == second.parameters
+    assert first.best.residuals.tobytes() == second.best.residuals.tobytes()
+    assert [chain.tobytes() for chain in first.chains] == [chain.tobytes() for chain in second.chains]
+    assert (first.stop_reason, first.warnings) == (second.stop_reason, second.warnings)
+
+
+def threads():
+    return ThreadPoolExecutor(2)
+
+
+def processes():
+    return ProcessPoolExecutor(2, mp_context=get_context('spawn'))
+
+
+@pytest.mark.parametrize('make', [threads, processes])
+def test_any_executor_gives_the_same_result_bit_for_bit(make):
+    simulator = ToySimulator(fail_below=10.0)
+    seen = []
+    with make() as executor:
+        elsewhere = found(simulator=simulator, budget=80, executor=executor, on_evaluation=seen.append)
+        again = found(simulator=simulator, budget=80, executor=executor)
+    here = found(simulator=simulator, budget=80)
+    same(here, elsewhere)
+    same(here, again)
+    assert [evaluation.index for evaluation in seen] == list(range(80))
+    assert found(seed=2, budget=80).best.scores != here.best.scores
+
+
+def test_a_stop_elsewhere_gives_the_first_evaluations_in_order():
+    seen = []
+    with ThreadPoolExecutor(2) as executor:
+        result = found(executor=executor, on_evaluation=seen.append, should_stop=lambda: len(seen) >= 10)
+    assert len(result.evaluations) == len(seen) == 10
+    assert result.stop_reason == 'stopped on request'
+    assert [e.scores for e in seen] == [e.scores for e in found(budget=10).evaluations]
+
+
+def test_trials_of_unequal_shape_are_compared_each_by_itself():
+    long = toy_trial(TRUTH, 'long', n=21)
+    goal = long.goals[0]
+    several = Trial('several', long.initial, long.actions, (goal, Goal(goal.chain, 4.0)))
+    result = found(trials=(TRIALS[0], several), budget=10)
+    assert [chains.shape for chains in result.chains] == [(1, 11, 3), (2, 21, 3)]
+    assert result.best.residuals.shape == (11 * 3 + 2 * 21 * 3,)
+    for trial, chains in zip(result.trials, result.chains, strict=True):
+        assert chains == pytest.approx(ToySimulator().simulate(trial, result.physical()).chains, abs=1e-12)

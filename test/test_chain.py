@@ -1,0 +1,172 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The chain: a curve through all its points, lengths along it, and what is refused."""
+
+from dataclasses import FrozenInstanceError
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from dlo_calibration import Chain, InputError
+from dlo_calibration.chain import bezier_curve, interpolation_matrix
+
+LINE = np.array([[0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
+
+
+@st.composite
+def chains(draw):
+    """Walk 3 to 30 unequal steps, none of them back on the one before."""
+    count = draw(st.integers(2, 29))
+    seed = draw(st.integers(0, 2**32 - 1))
+    generator = np.random.default_rng(seed)
+    steps = generator.uniform(-0.02, 0.02, (count, 3)) + (0.03, 0, 0)
+    steps *= generator.uniform(0.3, 3, (count, 1))
+    return Chain(np.concatenate([[[0.5, -2, 1]], [[0.5, -2, 1]] + np.cumsum(steps, axis=0)]))
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(chains())
+def test_the_curve_passes_through_every_point_at_its_own_place(chain):
+    places = chain.arc_lengths()
+    assert places[0] == 0
+    assert places[-1] == chain.length
+    assert chain.resample(places) == pytest.approx(chain.points, abs=1e-12)
+    # No point lies nearer along the curve than it does in space.
+    assert (np.diff(places) >= np.linalg.norm(np.diff(chain.points, axis=0), axis=1) - 1e-12).all()
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(chains(), st.floats(0, 1))
+def test_a_resampled_point_lies_as_far_along_as_was_asked(chain, share):
+    at = share * chain.length
+    fine = chain.resample(np.linspace(0, at, 2000))
+    walked = np.linalg.norm(np.diff(fine, axis=0), axis=1).sum()
+    assert walked == pytest.approx(at, abs=2e-3 * chain.length)
+
+
+def circle(angles, radius=0.3, pitch=0.0):
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), pitch * angles], axis=1)
+
+
+@pytest.mark.parametrize('pitch', [0.0, 0.1])
+def test_length_of_a_circle_and_a_helix_from_few_points(pitch):
+    exact = 1.5 * np.pi * np.hypot(0.3, pitch)
+    errors = [abs(Chain(circle(np.linspace(0, 1.5 * np.pi, n), pitch=pitch)).length / exact - 1)
+              for n in (9, 17, 33)]
+    assert errors[0] < 2e-3  # the polygon through the same points: 1.4e-2
+    assert errors[1] < errors[0] / 10
+    assert errors[2] < errors[1] / 8
+
+
+def test_places_on_an_arc_of_unequally_spaced_points():
+    angles = np.cumsum(np.tile([0.05, 0.15, 0.1], 10))
+    chain = Chain(circle(angles))
+    assert chain.arc_lengths() == pytest.approx(0.3 * (angles - angles[0]), rel=1e-4)
+    between = np.linspace(angles[0], angles[-1], 77)
+    assert chain.resample(0.3 * (between - angles[0])) == pytest.approx(circle(between), abs=5e-5)
+
+
+def test_a_straight_chain_is_exact_whatever_its_spacing():
+    chain = Chain(LINE)
+    assert chain.length == pytest.approx(0.6, rel=1e-12)
+    assert chain.arc_lengths() == pytest.approx(LINE[:, 0], abs=1e-12)
+    # The curve's own parameter is not its length between unequal points; the table's resolution remains.
+    assert chain.resample([0.05, 0.2, 0.45])[:, 0] == pytest.approx([0.05, 0.2, 0.45], abs=3e-4)
+    assert np.abs(chain.resample(np.linspace(0, 0.6, 50))[:, 1:]).max() < 1e-12
+
+
+def test_beyond_its_ends_the_curve_stays_at_them():
+    assert Chain(LINE).resample([-1.0, 7.0]) == pytest.approx(LINE[[0, -1]], abs=1e-12)
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(st.lists(st.floats(0.01, 2), min_size=2, max_size=12),
+       st.lists(st.floats(0, 1), min_size=1, max_size=9), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_a_parabola_is_reproduced_exactly(steps, shares, factors):
+    knots = np.concatenate([[0.0], np.cumsum(steps)])
+
+    def parabola(t):
+        return np.stack([factors[0] + factors[1] * t + factors[2] * t**2, t, t * 0], axis=1)
+
+    at = np.array(shares) * knots[-1]
+    size = 1 + np.abs(parabola(knots)).max()
+    assert np.abs(bezier_curve(knots, parabola(knots), at) - parabola(at)).max() < 1e-9 * size
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(chains(), st.integers(1, 40))
+def test_interpolation_matrix_gives_the_curve(chain, count):
+    knots = chain.arc_lengths()
+    at = np.random.default_rng(count).uniform(-0.1, 1.1, count) * knots[-1]
+    weights = interpolation_matrix(knots, at)
+    assert weights.shape == (count, len(chain))
+    assert weights.sum(axis=1) == pytest.approx(np.ones(count))
+    assert weights @ chain.points == pytest.approx(bezier_curve(knots, chain.points, at), abs=1e-12)
+
+
+def test_a_chain_is_a_read_only_copy():
+    points = LINE.copy()
+    hands, features = np.array([1, 0, 0, 0, 2]), np.array([False, True, False, False, False])
+    chain = Chain(points, hands, features)
+    points[0] = hands[0] = features[1] = 9
+    assert chain.points.tolist() == LINE.tolist()
+    assert chain.hands.tolist() == [1, 0, 0, 0, 2]
+    assert chain.features.tolist() == [False, True, False, False, False]
+    for array in (chain.points, chain.hands, chain.features):
+        with pytest.raises(ValueError):
+            array[0] = 1
+    with pytest.raises(FrozenInstanceError):
+        chain.points = LINE
+
+
+def test_annotations_that_are_not_given():
+    chain = Chain(LINE.tolist())
+    assert chain.hands is None  # the source does not tell, which is not the same as no hand
+    assert chain.features.tolist() == [False] * 5
+    assert len(chain) == 5
+
+
+REFUSED = {
+    'shape': ({'points': np.zeros((5, 2))}, '(5, 2)', '(n, 3)', 'x y z'),
+    'flat': ({'points': np.arange(9.0)}, '(9,)', '(n, 3)', 'x y z'),
+    'few': ({'points': LINE[:2]}, '2 point', 'at least 3', 'whole DLO'),
+    'nan': ({'points': np.where(LINE == 0.25, np.nan, LINE)}, 'NaN or infinity in point(s) 2', 'finite',
+            'leave such frames out'),
+    'infinite': ({'points': np.where(LINE == 0.6, -np.inf, LINE)}, 'NaN or infinity in point(s) 4', 'finite',
+                 'leave such frames out'),
+    'coincident': ({'points': LINE[[0, 1, 1, 2, 3]]}, 'coincident neighbours after point(s) 1', 'apart',
+                   'remove the repeated points'),
+    'hands': ({'points': LINE, 'hands': [1, 0, 0]}, "'hands': got shape (3,)", 'each of the 5 points',
+              'one value per point'),
+    'features': ({'points': LINE, 'features': [[1], [0], [0], [0], [1]]}, "'features': got shape (5, 1)",
+                 'each of the 5 points', 'one value per point'),
+}
+
+
+@pytest.mark.parametrize('name', REFUSED)
+def test_refusals_say_what_came_what_was_expected_and_what_to_do(name):
+    arguments, came, expected, remedy = REFUSED[name]
+    with pytest.raises(InputError) as refusal:
+        Chain(**arguments)
+    text = str(refusal.value)
+    assert text.startswith('chain')
+    assert text.index(came) < text.index(expected) < text.index(remedy)
+
+
+def test_many_bad_points_are_counted_not_listed():
+    with pytest.raises(InputError, match=r'point\(s\) 0, 1, 2, 3, 4 and 95 more'):
+        Chain(np.full((100, 3), np.nan))

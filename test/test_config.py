@@ -1,0 +1,162 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every option: its default, its type, its range, and what is refused."""
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+from dlo_calibration import InputError
+from dlo_calibration.config import declarations, FIXED_VALUES, Options
+from dlo_calibration.parameters import PARAMETERS
+from dlo_calibration.search import SEARCHES
+
+DECLARED = {declaration.name: declaration for declaration in declarations()}
+
+#: The defaults that are part of the message contract.
+CONTRACT = {
+    'mass': 0.0, 'table': True, 'table_height': 0.0,
+    'calibrate': ['flexibility', 'elasticity', 'friction', 'self_collision'],
+    'search': 'random', 'evaluations': 150, 'grip_tolerance': 0.02, 'length_tolerance': 50.0,
+    'start_after_trials': 0, 'output_directory': '.', 'record': True, 'release': True,
+    'engine': 'bullet', 'workers': 0,
+}
+MORE = {'seed', 'stable_distance', 'stable_time', 'settle_limit'}
+
+
+def test_defaults_are_those_of_the_contract():
+    flat = Options().flat()
+    assert {name: flat[name] for name in CONTRACT} == CONTRACT
+    assert MORE <= set(flat)
+
+
+def test_there_is_an_option_for_every_value_that_is_not_calibrated():
+    assert set(FIXED_VALUES) == {parameter.name for parameter in PARAMETERS} - {'mass'}
+    assert set(FIXED_VALUES) <= set(DECLARED)
+
+
+@pytest.mark.parametrize('declaration', DECLARED.values(), ids=DECLARED)
+def test_every_option_is_declared_completely(declaration):
+    assert declaration.description
+    assert type(declaration.default) in (bool, int, float, str, tuple)
+    if type(declaration.default) in (int, float):
+        assert declaration.minimum <= declaration.default <= declaration.maximum
+    if declaration.choices:
+        chosen = declaration.default if isinstance(declaration.default, tuple) else (declaration.default,)
+        assert set(chosen) <= set(declaration.choices)
+    assert Options.of({declaration.name: declaration.default}) == Options()
+
+
+WRONG = {bool: (1, 'true', None), int: (1.0, '1', True, None), float: ('1', True, None, [1.0]),
+         str: (1, None, ['a']), tuple: ('friction', 1, [1], None)}
+EXPECTED = {bool: 'true or false', int: 'an integer', float: 'a number', str: 'a text',
+            tuple: 'a list of names'}
+
+
+@pytest.mark.parametrize('name', DECLARED)
+def test_another_type_is_refused(name):
+    kind = type(DECLARED[name].default)
+    for value in WRONG[kind]:
+        with pytest.raises(InputError) as refusal:
+            Options.of({name: value})
+        assert refusal.value.thing == f'parameter {name}'
+        assert refusal.value.expected == EXPECTED[kind]
+
+
+@pytest.mark.parametrize('name', [name for name in DECLARED if type(DECLARED[name].default) in (int, float)])
+def test_numbers_out_of_range_are_refused_and_the_ends_are_not(name):
+    declaration = DECLARED[name]
+    kind = type(declaration.default)
+    low, high = kind(declaration.minimum), kind(declaration.maximum)
+    for end in (low, high):
+        assert Options.of({name: end}).flat()[name] == end
+    step = 1 if kind is int else 1e-3 * (high - low)
+    beyond = [low - step, high + step] + ([math.nan, math.inf, -math.inf] if kind is float else [])
+    for value in beyond:
+        with pytest.raises(InputError) as refusal:
+            Options.of({name: value})
+        assert f'parameter {name}: got {value:g}' in str(refusal.value)
+        assert f'expected {low:g} to {high:g}' in str(refusal.value)
+
+
+@pytest.mark.parametrize('name', [name for name in DECLARED if DECLARED[name].choices])
+def test_only_choices_can_be_chosen(name):
+    declaration = DECLARED[name]
+    several = isinstance(declaration.default, tuple)
+    for choice in declaration.choices:
+        value = [choice] if several else choice
+        assert Options.of({name: value}).flat()[name] == value
+    with pytest.raises(InputError) as refusal:
+        Options.of({name: [declaration.choices[0], 'nonsense'] if several else 'nonsense'})
+    assert f"parameter {name}: got 'nonsense', expected one of {', '.join(declaration.choices)}" \
+        in str(refusal.value)
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="parameter: got 'evalutions', expected one of mass, table, "):
+        Options.of({'evalutions': 10})
+    with pytest.raises(InputError, match="parameter: got 'values'"):
+        Options.of({'values': {}})
+    with pytest.raises(InputError, match="parameter: got 'mass'"):
+        Options(values={'mass': 42.0})
+
+
+def test_an_integer_is_a_number_too():
+    assert Options.of({'mass': 1, 'friction': 30}).flat()['mass'] == 1.0
+
+
+@pytest.mark.parametrize('names', [[], ['friction', 'friction']])
+def test_a_calibration_of_nothing_or_of_something_twice_is_refused(names):
+    with pytest.raises(InputError, match='calibrate: got .* expected one or more different names'):
+        Options.of({'calibrate': names})
+
+
+def values(declaration):
+    """Return a strategy for the values that an option may have."""
+    kind = type(declaration.default)
+    if kind is bool:
+        return st.booleans()
+    if kind is int:
+        return st.integers(declaration.minimum, declaration.maximum)
+    if kind is float:
+        return st.floats(declaration.minimum, declaration.maximum)
+    if kind is tuple:
+        return st.lists(st.sampled_from(declaration.choices), min_size=1, unique=True)
+    return st.sampled_from(declaration.choices) if declaration.choices else st.text()
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.fixed_dictionaries({}, optional={name: values(d) for name, d in DECLARED.items()}))
+def test_flat_and_of_are_inverse(given_options):
+    options = Options.of(given_options)
+    flat = options.flat()
+    assert set(flat) == set(DECLARED)
+    assert {name: flat[name] for name in given_options} == given_options
+    assert Options.of(flat) == options
+    assert {name: value for name, value in flat.items() if name not in given_options} \
+        == {name: value for name, value in Options().flat().items() if name not in given_options}
+
+
+def test_the_space_follows_from_the_options():
+    space = Options.of({'calibrate': ['friction', 'mass'], 'flexibility': 10.0, 'mass': 0.2}).space
+    assert space.free == ('friction', 'mass')
+    assert space.mass == 0.2
+    assert space.fixed['flexibility'] == 10.0
+
+
+def test_every_search_can_be_chosen():
+    assert DECLARED['search'].choices == tuple(SEARCHES)

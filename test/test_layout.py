@@ -1,0 +1,143 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where the nodes lie, how observed points follow from them, and the height at which a DLO rests."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
+from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
+
+
+def arc(count=21, height=0.0):
+    """Return a quarter of a circle of radius 0.4 m."""
+    angle = np.linspace(0, np.pi / 2, count)
+    return np.stack([0.4 * np.sin(angle), 0.4 * (1 - np.cos(angle)), 0 * angle + height], axis=1)
+
+
+def trial(points, grips=((0,),), goals=None, velocity=None):
+    hands = [Hand(f'hand {k}', grip, [0.0, 1.0], np.zeros((2, 3))) for k, grip in enumerate(grips)]
+    goals = goals or (Goal(Chain(points), 2.0),)
+    return Trial('t', Chain(points), (Action(hands),), goals, velocity)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.floats(0.001, 1.0), min_size=1, max_size=8), st.integers(0, 60))
+def test_places_contain_the_fixed_ones_and_are_as_even_as_these_allow(widths, more):
+    fixed = np.concatenate([[0.0], np.cumsum(widths)])
+    count = len(fixed) + more
+    places = spread_places(fixed, count)
+    assert len(places) == count
+    assert (np.diff(places) > 0).all()
+    assert np.isin(fixed, places).all()
+    # Pieces that are all narrower than the widest one would be more than there are.
+    widest = np.diff(places).max()
+    fewest = sum(max(1, int(np.ceil(width / (0.999 * widest) - 1e-9))) for width in widths)
+    assert fewest > count - 1
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.integers(0, 20), min_size=1, max_size=10, unique=True), st.integers(12, 60))
+def test_every_gripped_point_has_a_node_of_its_own(grips, count):
+    layout = Layout.of(trial(arc(), (tuple(grips),)), count)
+    assert layout.places.shape == (count,)
+    assert layout.points.shape == layout.velocities.shape == (count, 3)
+    nodes = layout.nodes(trial(arc(), (tuple(grips),)).hands[0])
+    assert len(set(nodes)) == len(grips)
+    assert layout.places[list(nodes)] == pytest.approx(layout.point_places[grips], abs=1e-12)
+    assert layout.points[list(nodes)] == pytest.approx(arc()[grips], abs=1e-9)
+
+
+@pytest.mark.parametrize('count', [15, 31, 61])
+def test_nodes_lie_on_the_curve_and_give_the_observed_points_back(count):
+    layout = Layout.of(trial(arc()), count)
+    assert layout.places == pytest.approx(np.linspace(0, 0.2 * np.pi, count), rel=1e-4)
+    radius = np.linalg.norm(layout.points - (0, 0.4, 0), axis=1)
+    assert radius == pytest.approx(np.full(count, 0.4), abs=2e-5)
+    assert layout.observe @ layout.points == pytest.approx(arc(), abs=1e-4)
+
+
+def test_a_trial_starts_at_rest_or_with_the_velocity_between_its_points():
+    assert not Layout.of(trial(arc()), 31).velocities.any()
+    points = arc()
+    turning = np.cross((0, 0, 2.0), points)
+    layout = Layout.of(trial(points, velocity=turning), 47)
+    assert layout.velocities == pytest.approx(np.cross((0, 0, 2.0), layout.points), abs=1e-4)
+
+
+def test_more_grips_than_nodes_are_refused():
+    with pytest.raises(InputError) as refusal:
+        Layout.of(trial(arc(), (tuple(range(1, 20)),)), 20)
+    text = str(refusal.value)
+    assert text.startswith("trial 't': got 19 gripped points, expected fewer than the 20 nodes; ")
+    assert len(Layout.of(trial(arc(), (tuple(range(1, 20)),)), 21).places) == 21
+
+
+def test_a_layout_is_read_only():
+    layout = Layout.of(trial(arc()), 31)
+    for array in (layout.places, layout.points, layout.velocities, layout.observe):
+        with pytest.raises(ValueError):
+            array[0] = 1
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.floats(-2, 2), st.floats(0.002, 0.03))
+def test_a_resting_chain_shows_its_level_through_noise(seed, table, radius):
+    noise = np.random.default_rng(seed).normal(0, 0.001, (21, 3))
+    points = arc(height=table + radius) + noise
+    assert resting_level(trial(points), table) == pytest.approx(table + radius, abs=0.0015)
+
+
+def test_a_lifted_part_does_not_raise_the_level():
+    points = arc(height=0.008)
+    points[10:, 2] += np.linspace(0.01, 0.3, 11)
+    assert resting_level(trial(points), 0.0) == pytest.approx(0.008)
+
+
+def test_the_level_is_seen_in_a_goal_where_the_chain_hung_at_the_start():
+    lifted = arc(height=0.3)
+    lifted[:, 2] += np.linspace(0, 0.2, 21)
+    laid = trial(lifted, goals=(Goal(Chain(arc(height=0.005)), 2.0),))
+    assert resting_level(laid, 0.0) == pytest.approx(0.005)
+    flown = trial(lifted, goals=(Goal(Chain(arc(height=0.005)), 0.5, stable=False),))
+    assert resting_level(flown, 0.0) is None  # it may be on its way down
+
+
+@pytest.mark.parametrize('points', [
+    np.stack([np.zeros(21), np.zeros(21), np.linspace(0.5, 0.001, 21)], axis=1),  # it hangs, and just touches
+    arc(height=0.5),  # level, but high above the table
+], ids=['upright', 'high'])
+def test_a_chain_that_does_not_lie_on_the_table_shows_no_level(points):
+    assert resting_level(trial(points), 0.0) is None
+
+
+def test_a_moving_chain_shows_no_level_at_its_start():
+    moving = trial(arc(height=0.005), goals=(Goal(Chain(arc(height=0.5)), 2.0),), velocity=np.zeros((21, 3)))
+    assert resting_level(moving, 0.0) is None
+
+
+def test_points_that_rest_are_put_on_the_level_and_others_are_left():
+    points = arc(height=0.008)
+    points[:, 2] += np.linspace(-0.004, 0.05, 21)
+    rested = rest_on(points, 0.008)
+    assert (rested[:, 2] >= 0.008).all()
+    assert rested[:, :2].tolist() == points[:, :2].tolist()
+    high = points[:, 2] > 0.015
+    assert rested[high].tolist() == points[high].tolist()
+    low = points[:, 2] < 0.010
+    assert (rested[low, 2] == 0.008).all()
+    assert points[0, 2] == pytest.approx(0.004)  # the given ones stay as they were

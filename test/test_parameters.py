@@ -1,0 +1,157 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The 0..100 scale: what each value means physically, and what stays where nothing is known."""
+
+import math
+import subprocess
+import sys
+
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from dlo_calibration import InputError, PARAMETERS, ParameterSpace
+from dlo_calibration.parameters import BY_NAME
+
+PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
+WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known
+
+MAPPING = {
+    'flexibility': lambda u: 10 ** (-1 - 4.5 * u / 100),
+    'elasticity': lambda u: 10 ** (4 - 3 * u / 100),
+    'friction': lambda u: 10 ** (-2 + 2.3 * u / 100),
+    'self_collision': lambda u: 0.002 * 15 ** (u / 100),
+}
+
+
+@pytest.mark.parametrize('name', PAPER)
+def test_the_papers_four_have_their_documented_quantities(name):
+    for value in (0, 1, 25, 50, 87.5, 100):
+        assert BY_NAME[name].physical(value) == pytest.approx(MAPPING[name](value), rel=1e-12)
+
+
+@pytest.mark.parametrize(('name', 'at_zero', 'at_hundred', 'unit'), [
+    ('flexibility', 0.1, 10**-5.5, 'N m^2'), ('elasticity', 1e4, 10.0, 'N'),
+    ('friction', 0.01, 10**0.3, '1'), ('self_collision', 0.002, 0.03, 'm')])
+def test_the_ends_of_the_scale(name, at_zero, at_hundred, unit):
+    assert BY_NAME[name].physical(0) == pytest.approx(at_zero, rel=1e-12)
+    assert BY_NAME[name].physical(100) == pytest.approx(at_hundred, rel=1e-12)
+    assert BY_NAME[name].unit == unit
+
+
+@pytest.mark.parametrize('parameter', PARAMETERS, ids=lambda parameter: parameter.name)
+@given(u=st.floats(0, 100), v=st.floats(0, 100))
+def test_every_scale_is_monotonic_and_can_be_inverted(parameter, u, v):
+    assert parameter.value(parameter.physical(u)) == pytest.approx(u, abs=1e-9)
+    if abs(u - v) > 1e-6:
+        rises = parameter.at_hundred > parameter.at_zero
+        assert (parameter.physical(u) < parameter.physical(v)) == ((u < v) == rises)
+
+
+@pytest.mark.parametrize('parameter', PARAMETERS, ids=lambda parameter: parameter.name)
+def test_every_parameter_says_what_it_is_and_has_a_default_on_the_scale(parameter):
+    assert parameter.quantity and parameter.unit and parameter.description
+    assert 0 <= parameter.default <= 100
+
+
+def test_the_space_is_the_papers_four_unless_told_otherwise():
+    space = ParameterSpace()
+    assert space.free == PAPER
+    assert space.dimension == 4
+
+
+def test_a_point_of_the_cube_and_the_values_of_its_parameters():
+    space = ParameterSpace(('friction', 'flexibility'))
+    assert space.values([0.25, 1.0]) == {'friction': 25.0, 'flexibility': 100.0}
+    assert space.point({'flexibility': 100.0, 'friction': 25.0}).tolist() == [0.25, 1.0]
+    with pytest.raises(ValueError):
+        space.values([0.5])  # a coordinate is missing
+
+
+def test_physical_values_are_the_found_ones_then_the_fixed_ones_then_the_defaults():
+    space = ParameterSpace(('flexibility',), {'friction': 10.0})
+    physical = space.physical({'flexibility': 60.0}, length=1.0)
+    assert set(physical) == set(BY_NAME)
+    assert physical['flexibility'] == pytest.approx(MAPPING['flexibility'](60), rel=1e-12)
+    assert physical['friction'] == pytest.approx(MAPPING['friction'](10), rel=1e-12)
+    assert physical['elasticity'] == pytest.approx(
+        MAPPING['elasticity'](BY_NAME['elasticity'].default), rel=1e-12)
+
+
+@pytest.mark.parametrize(('arguments', 'text'), [
+    ({'free': ('bendiness',)}, "parameter: got 'bendiness', expected one of flexibility, elasticity"),
+    ({'fixed': {'bendiness': 1}}, "parameter: got 'bendiness', expected one of flexibility, elasticity"),
+    ({'free': ()}, 'expected one or more different names'),
+    ({'free': ('friction', 'friction')}, 'expected one or more different names'),
+    ({'fixed': {'friction': 100.1}}, 'parameter friction: got 100.1, expected a value from 0 to 100'),
+    ({'fixed': {'friction': -1}}, 'parameter friction: got -1, expected a value from 0 to 100'),
+    ({'fixed': {'friction': math.nan}}, 'parameter friction: got nan, expected a value from 0 to 100'),
+])
+def test_refused_spaces(arguments, text):
+    with pytest.raises(InputError) as refusal:
+        ParameterSpace(**arguments)
+    assert text in str(refusal.value)
+    assert refusal.value.remedy
+
+
+def test_an_unknown_mass_is_that_of_the_assumed_density():
+    assert ParameterSpace().physical(dict.fromkeys(PAPER, 50), length=0.8)['mass'] == pytest.approx(0.04)
+    assert ParameterSpace(mass=0.3).physical(dict.fromkeys(PAPER, 50), length=0.8)['mass'] == 0.3
+
+
+def test_stiffness_is_reported_per_weight_where_the_mass_is_not_known():
+    space = ParameterSpace()
+    bending, unit = space.reported('flexibility', 40.0)
+    assert bending == pytest.approx(MAPPING['flexibility'](40) / WEIGHT)
+    assert unit == 'N m^2 per N/m'
+    stretching, unit = space.reported('elasticity', 40.0)
+    assert stretching == pytest.approx(MAPPING['elasticity'](40) / WEIGHT)
+    assert unit == 'N per N/m'
+    # What the weight has no part in stays what it is.
+    assert space.reported('friction', 40.0) == (pytest.approx(MAPPING['friction'](40)), '1')
+    assert space.reported('self_collision', 40.0) == (pytest.approx(MAPPING['self_collision'](40)), 'm')
+
+
+@pytest.mark.parametrize(
+    'known', [{'mass': 0.03}, {'free': ('flexibility', 'mass')}, {'fixed': {'mass': 50.0}}],
+    ids=['given', 'calibrated', 'fixed'])
+def test_stiffness_is_absolute_where_the_mass_is_given_calibrated_or_fixed(known):
+    space = ParameterSpace(**known)
+    assert space.mass_known
+    assert space.reported('flexibility', 40.0) == (pytest.approx(MAPPING['flexibility'](40)), 'N m^2')
+
+
+def test_the_mass_that_is_simulated_is_the_calibrated_or_fixed_one():
+    mass = BY_NAME['mass'].physical
+    fixed = ParameterSpace(('flexibility',), {'mass': 60.0})
+    assert fixed.physical({'flexibility': 1.0}, 1.0)['mass'] == pytest.approx(mass(60))
+    free = ParameterSpace(('mass',), mass=0.5)
+    assert free.physical({'mass': 70.0}, 1.0)['mass'] == pytest.approx(mass(70))
+
+
+def test_adding_a_parameter_is_one_entry():
+    """A new line of the table is an option, can be calibrated, and reaches the engines."""
+    program = """
+from dlo_calibration import parameters
+new = parameters.Parameter('stickiness', 'glue', 'N', 1.0, 100.0, 50.0, 'how it sticks')
+parameters.PARAMETERS += (new,)
+parameters.BY_NAME = {parameter.name: parameter for parameter in parameters.PARAMETERS}
+from dlo_calibration.config import Options
+assert 'stickiness' in Options().flat()
+space = Options.of({'calibrate': ['stickiness']}).space
+assert space.physical(space.values([1.0]), 1.0)['stickiness'] == 100.0
+assert Options.of({'stickiness': 0.0}).space.physical({}, 1.0)['stickiness'] == 1.0
+"""
+    subprocess.run([sys.executable, '-c', program], check=True)

@@ -1,0 +1,195 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The rod's forces and steps against mechanics: energies, momentum, and textbook deflections."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from dlo_calibration import SimulationError
+from dlo_calibration.rod import Rod, RodProperties
+
+GRAVITY = np.array([0, 0, -9.81])
+NONE = np.zeros(3)
+FREE = np.zeros((0, 3))
+CABLE = RodProperties(bending_stiffness=1e-2, stretching_stiffness=500.0, mass=0.05)
+
+
+def straight(rest_lengths):
+    return np.concatenate([[0.0], np.cumsum(rest_lengths)])[:, None] * (1.0, 0, 0)
+
+
+def crumpled(seed, rest_lengths, size=0.1):
+    generator = np.random.default_rng(seed)
+    points = straight(rest_lengths)
+    return points + size * np.mean(rest_lengths) * generator.normal(size=points.shape)
+
+
+def forces(rod, points, time_step):
+    """Return the forces that a step so short that it changes nothing reveals."""
+    return rod.masses[:, None] * rod.velocities(points, np.zeros_like(points), NONE, FREE) / time_step
+
+
+def energy(points, rest, properties):
+    segments = np.diff(points, axis=0)
+    stretch = np.linalg.norm(segments, axis=1) - rest
+    tangents = segments / rest[:, None]
+    cells = (rest[1:] + rest[:-1]) / 2
+    bend = np.linalg.norm(np.diff(tangents, axis=0), axis=1)
+    return (properties.stretching_stiffness / (2 * rest) * stretch**2).sum() + (
+        properties.bending_stiffness / (2 * cells) * bend**2).sum()
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_forces_are_the_slope_of_the_energy(seed, equal):
+    generator = np.random.default_rng(seed)
+    rest = np.full(7, 0.05) if equal else generator.uniform(0.02, 0.08, 7)
+    points = crumpled(seed, rest)
+    step = 1e-8
+    got = forces(Rod(rest, CABLE, step), points, step)
+    expected = np.zeros_like(points)
+    for index in np.ndindex(points.shape):
+        moved = np.zeros_like(points)
+        moved[index] = 1e-6
+        expected[index] = -(energy(points + moved, rest, CABLE) - energy(points - moved, rest, CABLE)) / 2e-6
+    assert got == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+
+
+def test_a_straight_rod_of_its_own_length_is_without_force():
+    rest = np.array([0.03, 0.05, 0.02, 0.06])
+    turned = straight(rest) @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    velocities = Rod(rest, CABLE, 0.004).velocities(turned + 3, np.zeros_like(turned), NONE, FREE)
+    assert np.abs(velocities).max() < 1e-9
+
+
+def test_masses_follow_the_lengths():
+    masses = Rod(np.array([0.1, 0.3, 0.2]), CABLE, 0.004).masses
+    assert masses == pytest.approx(0.05 / 0.6 * np.array([0.05, 0.2, 0.25, 0.1]))
+
+
+def test_free_fall():
+    rest = np.full(10, 0.05)
+    rod = Rod(rest, CABLE, 0.004)
+    points, velocities = straight(rest), np.tile((0.3, -0.2, 0.1), (11, 1))
+    for _ in range(50):
+        velocities = rod.velocities(points, velocities, GRAVITY, FREE)
+        points = points + 0.004 * velocities
+    assert velocities == pytest.approx(np.tile((0.3, -0.2, 0.1 - 9.81 * 0.2), (11, 1)), abs=1e-9)
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 0.1))
+def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
+    generator = np.random.default_rng(seed)
+    rest = generator.uniform(0.02, 0.08, 12)
+    rod = Rod(rest, RodProperties(1e-2, 500.0, 0.05, internal_damping=internal_damping), 0.004)
+    points = crumpled(seed, rest)
+    velocities = generator.normal(size=points.shape)
+    before = rod.masses @ velocities
+    for _ in range(20):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + 0.004 * velocities
+    assert rod.masses @ velocities == pytest.approx(before, abs=1e-10)
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(10, 1e4),
+       st.sampled_from([0.001, 0.005, 0.02]))
+def test_energy_never_grows(seed, bending, stretching, step):
+    rest = np.random.default_rng(seed).uniform(0.02, 0.05, 15)
+    properties = RodProperties(bending, stretching, 0.05)
+    rod = Rod(rest, properties, step)
+    points = crumpled(seed, rest, 0.02)
+    velocities = np.zeros_like(points)
+    start = energy(points, rest, properties)
+    for _ in range(200):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + step * velocities
+        total = energy(points, rest, properties) + (rod.masses[:, None] * velocities**2).sum() / 2
+        assert total < 1.05 * start
+    assert total < start
+
+
+@pytest.mark.parametrize('drag', [0.5, 2.0, 10.0])
+def test_drag_halves_the_velocity_in_the_time_it_says(drag):
+    step = 0.001
+    rest = np.full(5, 0.05)
+    rod = Rod(rest, RodProperties(1e-2, 500.0, 0.05, drag=drag), step)
+    points, velocities = straight(rest), np.tile((1.0, 0, 0), (6, 1))
+    for _ in range(round(np.log(2) / drag / step)):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + step * velocities
+    assert velocities[:, 0] == pytest.approx(np.full(6, 0.5), rel=0.01)
+
+
+def rest_of(rod, points, held, gravity, steps=60):
+    """Return where the rod comes to rest; steps as long as these are Newton's."""
+    rod.hold(held)
+    velocities = np.zeros_like(points)
+    for _ in range(steps):
+        velocities = rod.velocities(points, velocities, gravity, np.zeros((len(held), 3)))
+        points = points + 0.2 * velocities
+    assert np.abs(velocities).max() < 1e-7
+    return points
+
+
+def splits(name):
+    """Divide 1 m, after a clamped centimetre."""
+    widths = {'even': np.ones(40), 'alternating': np.tile([1.0, 2.5], 20), 'growing': np.geomspace(1, 8, 40),
+              'coarse': np.ones(12)}[name]
+    return np.concatenate([[0.01], widths / widths.sum()])
+
+
+@pytest.mark.parametrize('name', ['even', 'alternating', 'growing', 'coarse'])
+def test_a_cantilever_bends_by_the_textbook_whatever_its_segments(name):
+    rest = splits(name)
+    stiffness, mass = 0.8, 0.05  # it sinks by 8 cm in 1 m at gravity, by 0.8 mm at a hundredth of it
+    rod = Rod(rest, RodProperties(stiffness, 1e5, mass * rest.sum(), drag=5.0, internal_damping=0.2), 0.2)
+    tip = rest_of(rod, straight(rest), (0, 1), 0.01 * GRAVITY)[-1]
+    expected = -0.01 * 9.81 * mass / (8 * stiffness)
+    assert tip[2] == pytest.approx(expected, rel=0.02 if name == 'coarse' else 0.005)
+
+
+@pytest.mark.parametrize('name', ['even', 'alternating', 'growing'])
+def test_a_hanging_rod_stretches_by_the_textbook_whatever_its_segments(name):
+    rest = splits(name)
+    rod = Rod(rest, RodProperties(1e-3, 20.0, 0.05 * rest.sum(), drag=5.0, internal_damping=0.2), 0.2)
+    points = straight(rest) @ np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    stretch = -rest_of(rod, points, (0,), GRAVITY)[-1, 2] - rest.sum()
+    assert stretch == pytest.approx(9.81 * 0.05 * rest.sum()**2 / (2 * 20.0), rel=0.002)
+
+
+def test_held_nodes_follow_their_velocities():
+    rest = np.full(10, 0.05)
+    rod = Rod(rest, CABLE, 0.004)
+    rod.hold((7, 2))
+    assert rod.held.tolist() == [2, 7]
+    given_ones = np.array([[0.1, 0, 0], [0, -0.2, 0.3]])
+    velocities = rod.velocities(crumpled(0, rest), np.zeros((11, 3)), GRAVITY, given_ones)
+    assert velocities[[2, 7]] == pytest.approx(given_ones, abs=1e-6)
+    rod.hold(())
+    assert rod.velocities(straight(rest), np.zeros((11, 3)), GRAVITY, FREE) == pytest.approx(
+        np.tile(0.004 * GRAVITY, (11, 1)))
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+def test_what_is_not_finite_is_a_simulation_error(bad):
+    rest = np.full(4, 0.05)
+    points = straight(rest)
+    points[2, 1] = bad
+    with pytest.raises(SimulationError, match='diverged'), np.errstate(invalid='ignore'):
+        Rod(rest, CABLE, 0.004).velocities(points, np.zeros_like(points), GRAVITY, FREE)

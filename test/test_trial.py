@@ -1,0 +1,124 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The trial: order of actions and goals, which hands hold when, and what is refused."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
+
+POINTS = np.stack([np.linspace(0, 0.5, 6), np.zeros(6), np.zeros(6)], axis=1)
+CHAIN = Chain(POINTS)
+
+
+def hand(name, start, end, grips=(0,)):
+    return Hand(name, grips, [start, end], np.zeros((2, 3)))
+
+
+def trial(actions=None, goals=None, **rest):
+    actions = [Action([hand('left', 0.0, 1.0)])] if actions is None else actions
+    goals = [Goal(CHAIN, 2.0)] if goals is None else goals
+    return Trial('pull', CHAIN, actions, goals, **rest)
+
+
+def test_a_stable_goal_while_a_hand_moves_is_refused():
+    with pytest.raises(InputError, match='a stable goal at 2 s, while hand .left. moves'):
+        trial([Action([hand('left', 1.0, 3.0)])])
+    trial([Action([hand('left', 1.0, 3.0)])], [Goal(CHAIN, 2.0, stable=False)])
+
+
+def test_actions_and_goals_are_ordered_by_time():
+    actions = [Action([hand('left', start, start + 1)]) for start in (0.0, 3.0, 6.0)]
+    goals = [Goal(CHAIN, time) for time in (2.0, 5.0, 8.0)]
+    for order in permutations(range(3)):
+        mixed = trial([actions[k] for k in order], [goals[k] for k in order])
+        assert [action.start for action in mixed.actions] == [0, 3, 6]
+        assert [goal.time for goal in mixed.goals] == [2, 5, 8]
+        assert [hand.start for hand in mixed.hands] == [0, 3, 6]
+
+
+def test_hands_of_overlapping_actions_come_in_the_order_of_their_start():
+    first = Action([hand('a', 0.0, 9.0), hand('b', 4.0, 5.0)])
+    second = Action([hand('c', 2.0, 3.0)])
+    assert [hand.name for hand in trial([second, first], [Goal(CHAIN, 9.5)]).hands] == ['a', 'c', 'b']
+
+
+REFUSED = {
+    'no action': ({'actions': []}, 'no action', 'at least one'),
+    'no goal': ({'goals': []}, 'no goal chain', 'at least one'),
+    'points': ({'goals': [Goal(CHAIN, 2.0), Goal(Chain(POINTS[:5]), 3.0)]}, 'a goal of 5 points', '6 points'),
+    'grip beyond': ({'actions': [Action([hand('left', 0, 1, (2, 6))])]}, "'left' gripping points (2, 6)",
+                    'points 0 to 5'),
+    'grip before': ({'actions': [Action([hand('left', 0, 1, (-1,))])]}, "'left' gripping points (-1,)",
+                    'points 0 to 5'),
+    'velocity shape': ({'velocity': np.zeros((5, 3))}, '(5, 3)', '(6, 3)'),
+    'velocity nan': ({'velocity': np.full((6, 3), np.nan)}, 'a velocity', 'finite'),
+}
+
+
+@pytest.mark.parametrize('name', REFUSED)
+def test_refused_trials(name):
+    arguments, came, expected = REFUSED[name]
+    with pytest.raises(InputError) as refusal:
+        trial(**arguments)
+    text = str(refusal.value)
+    assert text.startswith("trial 'pull': got ")
+    assert text.index(came) < text.index(expected)
+    assert refusal.value.remedy
+
+
+def test_the_velocity_is_a_read_only_copy():
+    velocity = np.ones((6, 3))
+    moving = trial(velocity=velocity)
+    velocity[0] = 5
+    assert moving.velocity.tolist() == np.ones((6, 3)).tolist()
+    with pytest.raises(ValueError):
+        moving.velocity[0] = 1
+
+
+def names(trial, goal):
+    return [hand.name for hand in trial.holding(goal)]
+
+
+def test_a_hand_holds_from_its_first_waypoint_to_its_last():
+    waiting = trial([Action([hand('left', 1.0, 3.0)])], [Goal(CHAIN, 4.0)])
+    early = Goal(CHAIN, 0.5, stable=False)
+    assert names(waiting, early) == []
+    assert not waiting.holds(waiting.hands[0], early)
+    for time in (1.0, 2.0, 3.0):
+        assert names(waiting, Goal(CHAIN, time, stable=False)) == ['left']
+
+
+def test_after_its_last_waypoint_a_hand_holds_where_the_goal_shows_it():
+    done = trial([Action([hand('left', 0.0, 1.0), hand('right', 0.0, 1.0, (5,))])])
+    assert names(done, Goal(CHAIN, 2.0)) == []
+    assert names(done, Goal(CHAIN, 2.0, held_by=('right',))) == ['right']
+    assert names(done, Goal(CHAIN, 2.0, held_by=('left', 'right'))) == ['left', 'right']
+
+
+def test_a_goal_cannot_be_held_by_a_hand_that_comes_later():
+    later = trial([Action([hand('left', 0.0, 1.0)]), Action([hand('right', 5.0, 6.0)])])
+    assert names(later, Goal(CHAIN, 2.0, held_by=('left', 'right'))) == ['left']
+
+
+def test_a_later_hand_of_the_same_name_takes_over():
+    twice = trial([Action([hand('left', 0.0, 1.0, (0,))]), Action([hand('left', 3.0, 4.0, (5,))])])
+    for goal, grips in ((Goal(CHAIN, 2.0, held_by=('left',)), (0,)),
+                        (Goal(CHAIN, 3.5, stable=False), (5,)),
+                        (Goal(CHAIN, 6.0, held_by=('left',)), (5,))):
+        assert [hand.grips for hand in twice.holding(goal)] == [grips]
+    assert twice.holding(Goal(CHAIN, 6.0)) == ()
