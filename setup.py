@@ -73,6 +73,7 @@ setup(
             'colcon-core',
             'colcon-ros',
             'hypothesis>=6.98',
+            'mcap-ros2-support>=0.6',
             'mypy>=1.14',
             'pytest>=7.4',
             'pytest-benchmark>=4.0',

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import time
 
+from processes import children
 import pytest
 
 from dlo_calibration.demo import samples
@@ -57,13 +58,12 @@ def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path):
         assert time.monotonic() - begun < PATIENCE
         assert process.poll() is None
         time.sleep(0.02)
-    listing = subprocess.run(['ps', '--ppid', str(process.pid), '-o', 'pid='], stdout=subprocess.PIPE)
-    children = [int(pid) for pid in listing.stdout.split()]
+    started = children(process.pid)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert children
-    assert not any(os.path.exists(f'/proc/{pid}') for pid in children)
+    assert started
+    assert not any(os.path.exists(f'/proc/{pid}') for pid in started)
 
 
 def test_demo_says_what_is_wrong_with_a_sample(ros_environment, tmp_path):

@@ -25,6 +25,7 @@ import subprocess
 import sys
 import time
 
+from processes import children
 import pytest
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
@@ -507,12 +508,11 @@ def test_killed_node_leaves_a_readable_session_and_no_processes(ros_environment,
         robot.until_status(trials='2')
         robot.call('start')
         robot.until(lambda: robot.heard['progress'])
-        listing = subprocess.run(['ps', '--ppid', str(process.pid), '-o', 'pid='], stdout=subprocess.PIPE)
-        children = [int(pid) for pid in listing.stdout.split()]
-        assert len(children) >= 2
+        started = children(process.pid)
+        assert len(started) >= 2
         process.kill()
         process.wait()
-        robot.until(lambda: not any(Path(f'/proc/{pid}').exists() for pid in children))
+        robot.until(lambda: not any(Path(f'/proc/{pid}').exists() for pid in started))
     folder, = folders(tmp_path / 'out')
     session = read_session(folder)
     assert sorted(kind for kind, _ in session.messages) == sorted([INITIAL, ACTION, GOAL] * 2)

@@ -24,6 +24,7 @@ import threading
 import time
 
 import numpy as np
+from processes import children
 import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
@@ -148,9 +149,7 @@ def spawned(parent, count):
     """Wait until a process has `count` spawned children, and return their ids."""
     begun = time.monotonic()
     while time.monotonic() - begun < PATIENCE:
-        listing = subprocess.run(['ps', '--ppid', str(parent), '-o', 'pid=,args='], stdout=subprocess.PIPE)
-        lines = listing.stdout.decode().splitlines()
-        found = [int(line.split()[0]) for line in lines if 'spawn_main' in line]
+        found = [pid for pid, command in children(parent).items() if 'spawn_main' in command]
         if len(found) >= count:
             return found
         time.sleep(0.02)
