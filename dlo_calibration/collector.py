@@ -51,212 +51,16 @@ remembered; what arrives later than that is refused.
 from __future__ import annotations
 
 from bisect import bisect_right, insort
-from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Iterable, Union
+from typing import Iterable
 
-import numpy as np
-
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
-from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.messages import ACTION, INITIAL
+from dlo_calibration.segment import Key, Message, order, Segment
+from dlo_calibration.trial import Trial
 
-Message = Union[ChainMessage, ActionMessage]
-Key = tuple[int, int, tuple[str, ...]]
-
-VELOCITY_WINDOW = NANOSECONDS // 10  # an initial chain at least that much older gives no velocity
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
-RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}
-
-
-def order(message: Message) -> Key:
-    """Return what messages are sorted by; no two collected ones have the same."""
-    names = message.names if isinstance(message, ActionMessage) else ()
-    return message.stamp, RANKS[message.kind], names
-
-
-@dataclass(frozen=True)
-class _Move:
-    """An action that can be used: which points each of its hands grips, and when it moves [ns]."""
-
-    message: ActionMessage
-    grips: tuple[tuple[int, ...], ...]
-    instants: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """A goal chain that can be used; its annotation numbers the hands of `names`."""
-
-    message: ChainMessage
-    names: tuple[str, ...]
-    stable: bool
-    held_by: tuple[str, ...]
-
-
-@dataclass
-class _Segment:
-    """
-    Messages from one start to the next: a trial, complete or not.
-
-    The first segment of a collector has no start: it holds what came before any.
-    `extend` takes messages in order only.
-    """
-
-    first: Key
-    starts: list[ChainMessage] = field(default_factory=list)
-    moves: list[_Move] = field(default_factory=list)
-    sights: list[_Sight] = field(default_factory=list)
-    waiting: list[Message] = field(default_factory=list)
-    refused: list[tuple[Message, InputError]] = field(default_factory=list)
-    trial: Trial | None = None
-
-    @property
-    def busy(self) -> bool:
-        """Tell whether an initial chain that comes now begins the next trial."""
-        return bool(self.moves or self.sights or self.waiting or not self.starts)
-
-    @property
-    def complete(self) -> bool:
-        return bool(self.moves and self.sights)
-
-    @property
-    def spare(self) -> int:
-        """Number of messages that no trial uses."""
-        if not self.complete:
-            return len(self.starts) + len(self.moves) + len(self.waiting) + len(self.refused)
-        return max(len(self.starts) - 2, 0) + len(self.waiting) + len(self.refused)
-
-    def messages(self) -> list[Message]:
-        """Return all its messages, sorted."""
-        return sorted([*self.starts, *(m.message for m in self.moves), *(s.message for s in self.sights),
-                       *self.waiting, *(message for message, _ in self.refused)], key=order)
-
-    def extend(self, message: Message, options: Options) -> InputError | None:
-        """Take a message that is later than all others; return why it is not used, if it is not."""
-        try:
-            if message.kind == INITIAL:
-                self.starts.append(message)  # type: ignore[arg-type]
-            elif not self.starts:
-                self.waiting.append(message)
-            elif isinstance(message, ActionMessage):
-                self.moves.append(self._move(message, options))
-            elif not self.moves:
-                self.waiting.append(message)
-            else:
-                self.sights.append(self._sight(message, options))
-        except InputError as error:
-            self.refused.append((message, error))
-            return error
-        self.trial = None
-        return None
-
-    def _move(self, action: ActionMessage, options: Options) -> _Move:
-        latest, numbered = (self.sights[-1].message, self.sights[-1].names) if self.sights else \
-            (self.starts[-1], action.names)
-        chain = latest.chain
-        grips: list[tuple[int, ...]] = []
-        for name, position in zip(action.names, action.positions[0], strict=True):
-            held = np.zeros(0, int)
-            if chain.hands is not None and name in numbered:
-                held = np.flatnonzero(chain.hands == numbered.index(name) + 1)
-            if not len(held):
-                distances = np.linalg.norm(chain.points - position, axis=1)
-                held = np.array([distances.argmin()])
-                if distances.min() > options.grip_tolerance:
-                    raise InputError(
-                        str(action), f'{name} closing {distances.min():.4g} m from any point of {latest}',
-                        f'at most {options.grip_tolerance:g} m (grip_tolerance)',
-                        'check the first waypoint, or number the gripped points in the field hand')
-            twice = {grip for other in grips for grip in other} & set(held.tolist())
-            if twice:
-                raise InputError(
-                    str(action), f'two hands that grip point {min(twice)} of {latest}',
-                    'different points', 'number the gripped points in the field hand, or leave one hand out')
-            grips.append(tuple(held.tolist()))
-        return _Move(action, tuple(grips),
-                     tuple(action.stamp + round(float(t) * NANOSECONDS) for t in action.times))
-
-    def _sight(self, goal: ChainMessage, options: Options) -> _Sight:
-        start = self.starts[-1]
-        if len(goal.chain) != len(start.chain):
-            raise InputError(
-                str(goal), f'{len(goal.chain)} points',
-                f'{len(start.chain)} points as in {start}',
-                'send the same material points before and after the action')
-        change = abs(goal.length - start.length) / start.length * 100
-        if change > options.length_tolerance:
-            raise InputError(
-                str(goal), f'a length of {goal.length:.4g} m ({change:.0f} % from the '
-                f'{start.length:.4g} m of {start})',
-                f'at most {options.length_tolerance:g} % (length_tolerance)',
-                'check that both chains run along the whole DLO, in metres')
-        under_way = any(move.instants[0] <= goal.stamp <= move.instants[-1] for move in self.moves)
-        finished = [move for move in self.moves if move.instants[-1] < goal.stamp]
-        latest = self.moves[-1].message
-        held_by: tuple[str, ...] = ()
-        if goal.chain.hands is not None:
-            numbers = [int(k) for k in np.unique(goal.chain.hands) if k]
-            if numbers and numbers[-1] > len(latest.names):
-                raise InputError(
-                    str(goal), f'points held by hand {numbers[-1]}',
-                    f'hands 1 to {len(latest.names)} as in {latest}',
-                    'number the hands in the order of joint_names')
-            held_by = tuple(latest.names[k - 1] for k in numbers)
-        elif not options.release:
-            held_by = tuple(dict.fromkeys(name for move in finished for name in move.message.names))
-        return _Sight(goal, latest.names, bool(finished) and not under_way, held_by)
-
-    def build(self, name: str) -> Trial:
-        """Return the trial of a complete segment; the same object as long as it is the same."""
-        if self.trial is None:
-            self.trial = self._build(name)
-        elif self.trial.name != name:
-            self.trial = replace(self.trial, name=name)
-        return self.trial
-
-    def _build(self, name: str) -> Trial:
-        start, velocity = self.starts[-1], self._velocity()
-        zero = start.stamp
-        if velocity is None:
-            zero = min([self.sights[0].message.stamp, *(move.instants[0] for move in self.moves)])
-        actions = tuple(
-            Action(tuple(Hand(hand, move.grips[k], _seconds(move.instants, zero),
-                              move.message.positions[:, k], move.message.orientations[:, k])
-                         for k, hand in enumerate(move.message.names)))
-            for move in self.moves)
-        goals = tuple(Goal(sight.message.chain, float(_seconds([sight.message.stamp], zero)[0]), sight.stable,
-                           sight.held_by) for sight in self.sights)
-        return Trial(name, start.chain, actions, goals, velocity)
-
-    def _velocity(self) -> Floats | None:
-        if len(self.starts) < 2:
-            return None
-        earlier, start = self.starts[-2:]
-        elapsed = start.stamp - earlier.stamp
-        if elapsed >= VELOCITY_WINDOW or len(earlier.chain) != len(start.chain):
-            return None
-        return (start.chain.points - earlier.chain.points) * (NANOSECONDS / elapsed)
-
-    def lacks(self) -> str:
-        """Say in words what it takes to complete it; empty where it is complete."""
-        if self.complete:
-            return ''
-        if not self.starts:
-            return f'an initial_chain before {self.waiting[0]}' if self.waiting else ''
-        if not self.moves:
-            early = f' ({len(self.waiting)} goal_chain waiting for it)' if self.waiting else ''
-            return f'an action after {self.starts[-1]}{early}' + ('' if early else ', and a goal_chain')
-        early = f'; {self.waiting[-1]} is before it' if self.waiting else ''
-        return f'a goal_chain after {self.moves[0].message}{early}'
-
-
-def _seconds(instants: Iterable[int], zero: int) -> Floats:
-    """Return [ns] instants as seconds since `zero`; equal instants give equal numbers."""
-    return np.array([(instant - zero) / NANOSECONDS for instant in instants])
 
 
 class TrialCollector:
@@ -275,7 +79,7 @@ class TrialCollector:
     def clear(self) -> None:
         """Forget all messages, and the frame_id that they shared."""
         self._frame: str | None = None
-        self._segments = [_Segment((0, 0, ()))]
+        self._segments = [Segment((0, 0, ()))]
         self._known: dict[Key, Message] = {}
         self._newest: Key = (0, 0, ())
         self._spare = 0
@@ -307,7 +111,7 @@ class TrialCollector:
         if key > self._newest:
             self._newest = key
             if message.kind == INITIAL and last.busy:
-                last = _Segment(key)
+                last = Segment(key)
                 self._segments.append(last)
             before = last.spare
             error = last.extend(message, self._options)
@@ -380,16 +184,16 @@ class TrialCollector:
     def _insert(self, message: Message, key: Key) -> InputError | None:
         """Take a message that is earlier than another; return why it is not used, if it is not."""
         begin = end = self._place(key)
-        waiting, folded, found = [message], list[_Segment](), None
+        waiting, folded, found = [message], list[Segment](), None
         # further segments change only as long as the next start is not the next trial's
         while end < len(self._segments) and not (end > begin and folded[-1].busy):
             waiting = sorted([*waiting, *self._segments[end].messages()], key=order)
             if not folded:
-                folded.append(_Segment(self._segments[begin].first))
+                folded.append(Segment(self._segments[begin].first))
             for one in waiting:
                 orphans = begin == 0 and len(folded) == 1
                 if one.kind == INITIAL and folded[-1].busy and (folded[-1].starts or orphans):
-                    folded.append(_Segment(order(one)))
+                    folded.append(Segment(order(one)))
                 error = folded[-1].extend(one, self._options)
                 if one is message:
                     found = error
@@ -410,7 +214,7 @@ class TrialCollector:
     def _forget(self) -> None:
         """Forget the oldest messages that no trial uses, until half of KEPT are left."""
         surplus = self._spare - KEPT // 2
-        kept: list[_Segment] = []
+        kept: list[Segment] = []
         for segment, following in zip(self._segments, [*self._segments[1:], None], strict=True):
             before = segment.spare
             if surplus <= 0:
@@ -426,7 +230,7 @@ class TrialCollector:
         self._segments = kept
         self._spare = sum(segment.spare for segment in kept)
 
-    def _trim(self, segment: _Segment, surplus: int) -> None:
+    def _trim(self, segment: Segment, surplus: int) -> None:
         """Forget the oldest spare messages of a segment that stays."""
         count = min(surplus, len(segment.starts) - 2)
         if count > 0:

@@ -30,7 +30,7 @@ ORDER = (
     'errors', 'chain', 'action', 'trial', 'parameters', 'simulator', 'score', 'search', 'uncertainty',
     'calibration', '__init__', 'config',
     # messages and files
-    'messages', 'diagnostics', 'collector', 'recording', 'xml', 'session',
+    'messages', 'diagnostics', 'segment', 'collector', 'recording', 'xml', 'session',
     # engines
     'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',
     # edges

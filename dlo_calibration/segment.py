@@ -1,0 +1,224 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Segment: the messages from one start to the next, of which a trial is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Iterable, Union
+
+import numpy as np
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.chain import Floats
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.messages import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
+from dlo_calibration.trial import Goal, Trial
+
+Message = Union[ChainMessage, ActionMessage]
+Key = tuple[int, int, tuple[str, ...]]
+
+VELOCITY_WINDOW = NANOSECONDS // 10  # an initial chain at least that much older gives no velocity
+RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}
+
+
+def order(message: Message) -> Key:
+    """Return what messages are sorted by; no two collected ones have the same."""
+    names = message.names if isinstance(message, ActionMessage) else ()
+    return message.stamp, RANKS[message.kind], names
+
+
+@dataclass(frozen=True)
+class Move:
+    """An action that can be used: which points each of its hands grips, and when it moves [ns]."""
+
+    message: ActionMessage
+    grips: tuple[tuple[int, ...], ...]
+    instants: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A goal chain that can be used; its annotation numbers the hands of `names`."""
+
+    message: ChainMessage
+    names: tuple[str, ...]
+    stable: bool
+    held_by: tuple[str, ...]
+
+
+@dataclass
+class Segment:
+    """
+    Messages from one start to the next: a trial, complete or not.
+
+    The first segment of a collector has no start: it holds what came before any.
+    `extend` takes messages in order only.
+    """
+
+    first: Key
+    starts: list[ChainMessage] = field(default_factory=list)
+    moves: list[Move] = field(default_factory=list)
+    sights: list[Sight] = field(default_factory=list)
+    waiting: list[Message] = field(default_factory=list)
+    refused: list[tuple[Message, InputError]] = field(default_factory=list)
+    trial: Trial | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Tell whether an initial chain that comes now begins the next trial."""
+        return bool(self.moves or self.sights or self.waiting or not self.starts)
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether it is a trial."""
+        return bool(self.moves and self.sights)
+
+    @property
+    def spare(self) -> int:
+        """Number of messages that no trial uses."""
+        if not self.complete:
+            return len(self.starts) + len(self.moves) + len(self.waiting) + len(self.refused)
+        return max(len(self.starts) - 2, 0) + len(self.waiting) + len(self.refused)
+
+    def messages(self) -> list[Message]:
+        """Return all its messages, sorted."""
+        return sorted([*self.starts, *(m.message for m in self.moves), *(s.message for s in self.sights),
+                       *self.waiting, *(message for message, _ in self.refused)], key=order)
+
+    def extend(self, message: Message, options: Options) -> InputError | None:
+        """Take a message that is later than all others; return why it is not used, if it is not."""
+        try:
+            if message.kind == INITIAL:
+                self.starts.append(message)  # type: ignore[arg-type]
+            elif not self.starts:
+                self.waiting.append(message)
+            elif isinstance(message, ActionMessage):
+                self.moves.append(self._move(message, options))
+            elif not self.moves:
+                self.waiting.append(message)
+            else:
+                self.sights.append(self._sight(message, options))
+        except InputError as error:
+            self.refused.append((message, error))
+            return error
+        self.trial = None
+        return None
+
+    def _move(self, action: ActionMessage, options: Options) -> Move:
+        latest, numbered = (self.sights[-1].message, self.sights[-1].names) if self.sights else \
+            (self.starts[-1], action.names)
+        chain = latest.chain
+        grips: list[tuple[int, ...]] = []
+        for name, position in zip(action.names, action.positions[0], strict=True):
+            held = np.zeros(0, int)
+            if chain.hands is not None and name in numbered:
+                held = np.flatnonzero(chain.hands == numbered.index(name) + 1)
+            if not len(held):
+                distances = np.linalg.norm(chain.points - position, axis=1)
+                held = np.array([distances.argmin()])
+                if distances.min() > options.grip_tolerance:
+                    raise InputError(
+                        str(action), f'{name} closing {distances.min():.4g} m from any point of {latest}',
+                        f'at most {options.grip_tolerance:g} m (grip_tolerance)',
+                        'check the first waypoint, or number the gripped points in the field hand')
+            twice = {grip for other in grips for grip in other} & set(held.tolist())
+            if twice:
+                raise InputError(
+                    str(action), f'two hands that grip point {min(twice)} of {latest}',
+                    'different points', 'number the gripped points in the field hand, or leave one hand out')
+            grips.append(tuple(held.tolist()))
+        return Move(action, tuple(grips),
+                     tuple(action.stamp + round(float(t) * NANOSECONDS) for t in action.times))
+
+    def _sight(self, goal: ChainMessage, options: Options) -> Sight:
+        start = self.starts[-1]
+        if len(goal.chain) != len(start.chain):
+            raise InputError(
+                str(goal), f'{len(goal.chain)} points',
+                f'{len(start.chain)} points as in {start}',
+                'send the same material points before and after the action')
+        change = abs(goal.length - start.length) / start.length * 100
+        if change > options.length_tolerance:
+            raise InputError(
+                str(goal), f'a length of {goal.length:.4g} m ({change:.0f} % from the '
+                f'{start.length:.4g} m of {start})',
+                f'at most {options.length_tolerance:g} % (length_tolerance)',
+                'check that both chains run along the whole DLO, in metres')
+        under_way = any(move.instants[0] <= goal.stamp <= move.instants[-1] for move in self.moves)
+        finished = [move for move in self.moves if move.instants[-1] < goal.stamp]
+        latest = self.moves[-1].message
+        held_by: tuple[str, ...] = ()
+        if goal.chain.hands is not None:
+            numbers = [int(k) for k in np.unique(goal.chain.hands) if k]
+            if numbers and numbers[-1] > len(latest.names):
+                raise InputError(
+                    str(goal), f'points held by hand {numbers[-1]}',
+                    f'hands 1 to {len(latest.names)} as in {latest}',
+                    'number the hands in the order of joint_names')
+            held_by = tuple(latest.names[k - 1] for k in numbers)
+        elif not options.release:
+            held_by = tuple(dict.fromkeys(name for move in finished for name in move.message.names))
+        return Sight(goal, latest.names, bool(finished) and not under_way, held_by)
+
+    def build(self, name: str) -> Trial:
+        """Return the trial of a complete segment; the same object as long as it is the same."""
+        if self.trial is None:
+            self.trial = self._build(name)
+        elif self.trial.name != name:
+            self.trial = replace(self.trial, name=name)
+        return self.trial
+
+    def _build(self, name: str) -> Trial:
+        start, velocity = self.starts[-1], self._velocity()
+        zero = start.stamp
+        if velocity is None:
+            zero = min([self.sights[0].message.stamp, *(move.instants[0] for move in self.moves)])
+        actions = tuple(
+            Action(tuple(Hand(hand, move.grips[k], _seconds(move.instants, zero),
+                              move.message.positions[:, k], move.message.orientations[:, k])
+                         for k, hand in enumerate(move.message.names)))
+            for move in self.moves)
+        goals = tuple(Goal(sight.message.chain, float(_seconds([sight.message.stamp], zero)[0]), sight.stable,
+                           sight.held_by) for sight in self.sights)
+        return Trial(name, start.chain, actions, goals, velocity)
+
+    def _velocity(self) -> Floats | None:
+        if len(self.starts) < 2:
+            return None
+        earlier, start = self.starts[-2:]
+        elapsed = start.stamp - earlier.stamp
+        if elapsed >= VELOCITY_WINDOW or len(earlier.chain) != len(start.chain):
+            return None
+        return (start.chain.points - earlier.chain.points) * (NANOSECONDS / elapsed)
+
+    def lacks(self) -> str:
+        """Say in words what it takes to complete it; empty where it is complete."""
+        if self.complete:
+            return ''
+        if not self.starts:
+            return f'an initial_chain before {self.waiting[0]}' if self.waiting else ''
+        if not self.moves:
+            early = f' ({len(self.waiting)} goal_chain waiting for it)' if self.waiting else ''
+            return f'an action after {self.starts[-1]}{early}' + ('' if early else ', and a goal_chain')
+        early = f'; {self.waiting[-1]} is before it' if self.waiting else ''
+        return f'a goal_chain after {self.moves[0].message}{early}'
+
+
+def _seconds(instants: Iterable[int], zero: int) -> Floats:
+    """Return [ns] instants as seconds since `zero`; equal instants give equal numbers."""
+    return np.array([(instant - zero) / NANOSECONDS for instant in instants])
