@@ -199,10 +199,12 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                 if not stop():
                     raise
                 raise KeyboardInterrupt from None
-        if folder is not None:
-            _write(folder, chosen.session, found, result)
-            _note(f'{RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} are in {folder}')
-        _print_result(result, chosen.json)
+        try:
+            if folder is not None:
+                _write(folder, chosen.session, found, result)
+                _note(f'{RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} are in {folder}')
+        finally:  # a disk that is full by now must not lose what was found
+            _print_result(result, chosen.json)
     return 0
 
 
@@ -295,7 +297,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult) -> None:
-    """Write the three files of `fit`."""
+    """Write the files of `fit`."""
     from dlo_calibration.report import write_evaluations, write_report
 
     write_result(folder / RESULT, result, found.options.flat())

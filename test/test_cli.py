@@ -32,6 +32,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import cli
 from dlo_calibration.config import declarations, Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.messages import bag_types, INITIAL
 from dlo_calibration.session import read_session
 from dlo_calibration.worker import calibrate_with
@@ -127,6 +128,17 @@ def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_p
     best = min(rows, key=lambda row: float(row['score']))
     assert float(best['score']) == first['score']
     assert float(best['friction']) == first['parameters']['friction']['value']
+
+
+def test_fit_prints_what_it_found_where_the_disk_is_full_by_then(run, session, tmp_path, monkeypatch):
+    def full(*_):
+        raise InputError('file result.xml', 'No space left on device', 'room for it', 'make room')
+
+    monkeypatch.setattr(cli, 'write_result', full)
+    code, output, errors = run('fit', session, '--json', '--output', tmp_path / 'out', '--evaluations', 3)
+    assert code == 2
+    assert 'No space left on device' in errors
+    assert only_json(output)['evaluations'] == 3
 
 
 def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
