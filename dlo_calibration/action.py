@@ -26,7 +26,16 @@ from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError
 
 MAXIMUM_HANDS = 8
+MINIMUM_NORM, MAXIMUM_NORM = 0.5, 1000.0  # of a quaternion, which need not be normalised, but must be finite
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
+ROUNDING = 1e-12  # of the length of a unit quaternion
+
+
+def quaternion_lengths(orientations: Floats) -> Floats:
+    """Return the lengths of quaternions, (..., 4), also where their squares are no finite numbers."""
+    largest = np.abs(orientations).max(axis=-1, initial=1.0)
+    lengths: Floats = largest * np.linalg.norm(orientations / largest[..., None], axis=-1)
+    return lengths
 
 
 @dataclass(frozen=True)
@@ -71,13 +80,15 @@ class Hand:
         if (np.diff(times) <= 0).any():
             raise InputError(thing, 'waypoints whose times do not increase', 'increasing times',
                              'sort the waypoints and remove repeated ones')
-        norms = np.linalg.norm(orientations, axis=1, keepdims=True)
-        if (norms < 0.5).any():
-            raise InputError(thing, f'a quaternion of length {norms.min():.2g}', 'a unit quaternion x y z w',
+        norms = quaternion_lengths(orientations)[:, None]
+        bad = norms[(norms < MINIMUM_NORM) | (norms > MAXIMUM_NORM)]
+        if len(bad):
+            raise InputError(thing, f'a quaternion of length {bad[0]:.2g}', 'a unit quaternion x y z w',
                              'use 0 0 0 1 for a hand that does not turn')
         object.__setattr__(self, 'grips', tuple(dict.fromkeys(int(g) for g in self.grips)))
         object.__setattr__(self, 'times', times)
         object.__setattr__(self, 'positions', positions)
+        norms[np.abs(norms - 1) < ROUNDING] = 1  # dividing again would change the last digit
         object.__setattr__(self, 'orientations', frozen_array(orientations / norms))
 
     @property

@@ -29,20 +29,22 @@ from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
 from dlo_calibration.calibration import CalibrationResult, Evaluator, simulated_chains
 from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.recording import SessionWriter
+from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.trial import Trial
 from dlo_calibration.worker import calibrate_with, SimulatorFactory
-from dlo_calibration.xml import read_result, ResultFile, write_result
 
 PROGRAM = 'dlo-calibration'
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' convention
 #: Options that say what was observed, not how it is simulated.
 OF_THE_SESSION = ('table', 'table_height', 'grip_tolerance', 'length_tolerance', 'release')
 RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
+REQUEST = 'request.xml'
 
 
 def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
@@ -89,14 +91,21 @@ def _parser() -> argparse.ArgumentParser:
     validate = verb('validate', _validate, 'simulate a session with the parameters of a result; fit nothing')
     validate.add_argument('result', metavar='RESULT.xml', type=Path)
     info = verb('info', _info, 'say what is in a session')
-    for added in (fit, validate, info):
+    plot = verb('plot', _plot, 'draw a picture of each trial: measured, and simulated with a result')
+    for added in (fit, validate, plot, info):
         added.add_argument('session', metavar='SESSION', type=Path,
-                           help='an MCAP file, or the folder of a rosbag2 recording')
+                           help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
         added.add_argument('--namespace', help='of the topics, where the session holds several')
         added.add_argument('--json', action='store_true', help='print one JSON document')
         _add_options(added)
     fit.add_argument('--output', metavar='DIR', type=Path,
                      help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} there')
+    plot.add_argument('result', metavar='RESULT.xml', type=Path, nargs='?',
+                      help='simulate with its parameters; without it, only what was measured is drawn')
+    plot.add_argument('--output', metavar='DIR', type=Path, default=Path(),
+                      help='write trial_1.png, ... there; default: the current folder')
+    plot.add_argument('--animation', action='store_true',
+                      help='also write trial_1.gif, ...: how the simulated DLO moves')
     return parser
 
 
@@ -148,7 +157,10 @@ def _read(chosen: argparse.Namespace, note: Callable[[str], None],
     :param of_result: options of a result; of the recorded ones, only those in
         `OF_THE_SESSION` then count.
     """
-    session = read_session(chosen.session, chosen.namespace)
+    path = chosen.session
+    request = read_request(path) if _is_request(path) else None
+    session = read_session(path, chosen.namespace) if request is None else \
+        Session(path, (), (), dict(request.options), ())
     recorded = session.options or {}
     if of_result:
         observed = {name: value for name, value in recorded.items() if name in OF_THE_SESSION}
@@ -159,10 +171,20 @@ def _read(chosen: argparse.Namespace, note: Callable[[str], None],
         value = options.flat()[name]
         if value != recorded.get(name, value):
             note(f'{name}: {_shown(value)} instead of {_shown(recorded[name])}')
-    trials, refusals = session_trials(session, options)
+    trials, refusals = session_trials(session, options) if request is None else \
+        request_trials(request, options)
     for text in (*session.problems, *refusals):
         note(text)
     return _Input(session, options, trials, refusals)
+
+
+def _is_request(path: Path) -> bool:
+    return path.suffix.lower() == '.xml'
+
+
+def _copy_name(source: Path) -> str:
+    """Name the file that `fit` writes its input to."""
+    return REQUEST if _is_request(source) else SESSION
 
 
 def _shown(value: Any) -> str:
@@ -190,7 +212,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if folder is None and 'output_directory' in _given(chosen):
         folder = Path(found.options.output_directory)
     if folder is not None:
-        _make_folder(folder)
+        _make_folder(folder, _copy_name(chosen.session))
     with StopFlag() as stop:
         with SearchBar(found.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
             try:
@@ -202,7 +224,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         try:
             if folder is not None:
                 _write(folder, chosen.session, found, result)
-                _note(f'{RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} are in {folder}')
+                _note(f'{RESULT}, {_copy_name(chosen.session)}, {REPORT} and {EVALUATIONS} are in {folder}')
         finally:  # a disk that is full by now must not lose what was found
             _print_result(result, chosen.json)
     return 0
@@ -216,7 +238,35 @@ def _validate(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
     return 0
 
 
-def validated(file: ResultFile, trials: Sequence[Trial], options: Options,
+def _plot(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    from dlo_calibration.plot import write_animations, write_pictures
+
+    if chosen.animation and chosen.result is None:
+        raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
+                         f'name a result: {PROGRAM} plot SESSION RESULT.xml --animation')
+    file = None if chosen.result is None else read_result(chosen.result)
+    found = _read(chosen, _note, None if file is None else file.options)
+    trials = _some(found)
+    animations: list[Path] = []
+    if file is None:
+        pictures = write_pictures(trials, None, chosen.output, _note)
+    else:
+        result = validated(file, trials, found.options, make_simulator)
+        pictures = write_pictures(trials, result.chains, chosen.output, _note)
+        if chosen.animation:
+            simulator = make_simulator(found.options)
+            physical = file.space.physical(file.values, result.length)
+            try:
+                animations = write_animations(trials, simulator, physical, chosen.output, _note)
+            finally:
+                simulator.close()
+    if chosen.json:
+        _print_json({'pictures': [str(path) for path in pictures],
+                     'animations': [str(path) for path in animations]}, sys.stdout)
+    return 0
+
+
+def validated(file: Description, trials: Sequence[Trial], options: Options,
               make_simulator: SimulatorFactory = make_chosen_simulator) -> CalibrationResult:
     """
     Simulate trials with the parameters of a result; nothing is fitted.
@@ -285,10 +335,10 @@ def _print_result(result: CalibrationResult, as_json: bool) -> None:
     terminal.print_result(result, found['parameters'], sys.stdout)
 
 
-def _make_folder(folder: Path) -> None:
+def _make_folder(folder: Path, copy: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (RESULT, SESSION, REPORT, EVALUATIONS):
+        for name in (RESULT, copy, REPORT, EVALUATIONS):
             with (folder / name).open('ab'):
                 pass
     except OSError as error:
@@ -301,11 +351,12 @@ def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult)
     from dlo_calibration.report import write_evaluations, write_report
 
     write_result(folder / RESULT, result, found.options.flat())
-    _write_session(folder / SESSION, source, found)
+    copy = _copy_name(source)
+    _write_session(folder / copy, source, found)
     write_evaluations(folder / EVALUATIONS, result)
     flags = [flag for name, value in found.options.flat().items() if value != Options().flat()[name]
              for flag in _as_flags(name, value)]
-    command = ' '.join([PROGRAM, 'fit', SESSION, *flags])
+    command = ' '.join([PROGRAM, 'fit', copy, *flags])
     write_report(folder / REPORT, result, command, [*found.session.problems, *found.refusals])
 
 
@@ -317,10 +368,10 @@ def _as_flags(name: str, value: Any) -> list[str]:
 
 
 def _write_session(path: Path, source: Path, found: _Input) -> None:
-    """Copy a session into one MCAP file; one that is already such a file, byte by byte."""
+    """Copy a session into one MCAP file; one that is already such a file, or a request, byte by byte."""
     files = [source] if source.is_file() else sorted(source.glob('*.mcap'))
     try:
-        if len(files) == 1 and files[0].suffix == '.mcap':
+        if len(files) == 1 and (files[0].suffix == '.mcap' or _is_request(source)):
             if not (path.exists() and path.samefile(files[0])):
                 shutil.copyfile(files[0], path)
             return

@@ -40,8 +40,9 @@ other, and a robot may know what its hands did only when they have done it).
 A message that does not fit those before it is refused, and has no effect.  It is
 remembered, though, without effect: where a message arrives later that was
 stamped earlier, and it fits then, it is used.  Actions and goal chains without
-any initial chain wait in silence; they are refused once an initial chain is
-known that is later than they are.  A message of the same kind and stamp (and of
+any initial chain wait (`incomplete` says so); they are refused once an initial
+chain is known that is later than they are: those that had waited, together, as
+`news`.  A message of the same kind and stamp (and of
 the same hands) as one before is refused; it replaces one that was refused.
 
 Of the messages that no trial uses, the latest KEPT (at least half of them) are
@@ -56,7 +57,7 @@ from typing import Iterable
 
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import ACTION, INITIAL
+from dlo_calibration.messages import INITIAL
 from dlo_calibration.segment import Key, Message, order, Segment
 from dlo_calibration.trial import Trial
 
@@ -84,6 +85,7 @@ class TrialCollector:
         self._newest: Key = (0, 0, ())
         self._spare = 0
         self._forgotten: list[tuple[Key, Key]] = []  # from, up to but without
+        self._news: list[InputError] = []
 
     def with_options(self, options: Options) -> TrialCollector:
         """Return a collector of the same messages, also the refused ones, that judges by other options."""
@@ -107,7 +109,7 @@ class TrialCollector:
         self._check(message, key)
         self._frame = message.frame_id
         self._known[key] = message
-        last = self._segments[-1]
+        last, without_start = self._segments[-1], len(self._segments) == 1
         if key > self._newest:
             self._newest = key
             if message.kind == INITIAL and last.busy:
@@ -118,6 +120,8 @@ class TrialCollector:
             self._spare += last.spare - before
         else:
             error = self._insert(message, key)
+        if without_start and len(self._segments) > 1:
+            self._news += self._orphans()
         if self._spare > KEPT:
             self._forget()
         if error is not None:
@@ -128,6 +132,11 @@ class TrialCollector:
         """The complete trials in the order of their stamps: ``trial 1``, ``trial 2``, ..."""
         complete = [segment for segment in self._segments if segment.complete]
         return tuple(segment.build(f'trial {k}') for k, segment in enumerate(complete, start=1))
+
+    @property
+    def frame_id(self) -> str:
+        """That all messages share; empty where there was none yet."""
+        return self._frame or ''
 
     @property
     def count(self) -> int:
@@ -144,19 +153,25 @@ class TrialCollector:
         """
         Why messages are not used, as things stand, and which trials stay incomplete.
 
-        Also what `add` could not know when the message arrived.
+        Also what `add` could not know when the message arrived; but not what `take_news` gives.
         """
         found = [error for segment in self._segments for _, error in segment.refused]
-        if len(self._segments) > 1:
-            found += [self._no_start(message) for message in self._segments[0].waiting
-                      if message.kind == ACTION]
         for segment, following in pairwise(self._segments[1:]):
-            if segment.moves and not segment.complete:
-                found.append(InputError(
-                    f'trial that begins with {segment.starts[-1]}',
-                    f'no goal_chain between {segment.moves[0].message} and {following.starts[0]}',
-                    'at least one', 'send no initial chain before the goal chain of the trial'))
+            found += _cut_off(segment, f'and {following.starts[0]}',
+                              'send no initial chain before the trial is complete')
         return tuple(found)
+
+    @property
+    def loose_end(self) -> tuple[InputError, ...]:
+        """Why the newest trial is none, where nothing more comes; empty where it is one, or did not begin."""
+        if len(self._segments) == 1:
+            return self._orphans()
+        return _cut_off(self._segments[-1], 'and the end', 'send all messages of a trial')
+
+    def take_news(self) -> tuple[InputError, ...]:
+        """Return the refusals of messages that had waited, which the last message made certain."""
+        news, self._news = self._news, []
+        return tuple(news)
 
     def _check(self, message: Message, key: Key) -> None:
         """Refuse what can never be used; forget the refused message that `message` corrects."""
@@ -205,11 +220,17 @@ class TrialCollector:
             return self._no_start(message)
         return found
 
-    def _no_start(self, message: Message) -> InputError:
+    def _no_start(self, message: Message, more: int = 0) -> InputError:
+        first = f'the first is {self._segments[1].starts[0]}' if len(self._segments) > 1 else 'there is none'
         return InputError(
-            str(message), 'no initial_chain before it',
-            f'one stamped earlier (the first is {self._segments[1].starts[0]})',
+            f'{message} and {more} more' if more else str(message),
+            f'no initial_chain before {"them" if more else "it"}', f'one stamped earlier ({first})',
             'send the chain before the action begins, and stamp all messages with one clock')
+
+    def _orphans(self) -> tuple[InputError, ...]:
+        """Return one refusal of all messages before the first initial chain, if there are any."""
+        waiting = sorted(self._segments[0].waiting, key=order)
+        return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
     def _forget(self) -> None:
         """Forget the oldest messages that no trial uses, until half of KEPT are left."""
@@ -262,3 +283,14 @@ class TrialCollector:
             else:
                 merged.append(span)
         self._forgotten = merged
+
+
+def _cut_off(segment: Segment, until: str, remedy: str) -> tuple[InputError, ...]:
+    """Return why a segment to which nothing more comes is no trial, if more than its start came."""
+    if segment.complete or not (segment.moves or segment.waiting):
+        return ()
+    if segment.moves:
+        came = f'no goal_chain between {segment.moves[0].message} {until}'
+    else:
+        came = f'{len(segment.waiting)} goal_chain, but no action between {segment.starts[-1]} {until}'
+    return InputError(f'trial that begins with {segment.starts[-1]}', came, 'at least one', remedy),

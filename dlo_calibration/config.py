@@ -26,7 +26,7 @@ from typing import Any, Iterator, Mapping
 
 from dlo_calibration.calibration import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import BY_NAME, PAPER_PARAMETERS, PARAMETERS, ParameterSpace, SCALE
+from dlo_calibration.parameters import BY_NAME, measured, PAPER_PARAMETERS, PARAMETERS, ParameterSpace, SCALE
 from dlo_calibration.search import SEARCHES
 
 ENGINES = ('bullet',)
@@ -174,7 +174,7 @@ def _unknown(name: str) -> Any:
 FIXED_VALUES: Mapping[str, Declaration] = {
     p.name: Declaration(
         p.name, p.default, f'{p.description}: {p.quantity}, where it is not calibrated '
-        f'(0: {p.at_zero:.3g} {p.unit}, 100: {p.at_hundred:.3g} {p.unit}, logarithmic)',
+        f'(0: {measured(p.at_zero, p.unit)}, 100: {measured(p.at_hundred, p.unit)}, logarithmic)',
         minimum=0.0, maximum=SCALE)
     for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg of its own
 

@@ -35,13 +35,13 @@ from typing import Any, Callable, Iterator, Sequence
 from dlo_calibration import terminal
 from dlo_calibration.cli import document, validated
 from dlo_calibration.config import Options
+from dlo_calibration.description import read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.messages import INPUT_TYPES, rclpy_types
 from dlo_calibration.picture import session_picture
 from dlo_calibration.session import read_session, Session, session_trials
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.xml import read_result
 
 NODE = '/calibrator'
 EVALUATIONS = 100

@@ -21,11 +21,14 @@ from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.messages import MessageTypes
+from dlo_calibration.parameters import measured
 
 OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',
     'result': 'diagnostic_msgs/msg/DiagnosticArray',
+    'dlo_description': 'std_msgs/msg/String',
     'status': 'diagnostic_msgs/msg/DiagnosticArray',
+    'markers': 'visualization_msgs/msg/MarkerArray',
 }
 STATES = ('collecting', 'calibrating', 'done', 'failed')
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
@@ -58,7 +61,8 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
     """Build the message with the final parameter set: one status per parameter, one for the whole."""
     statuses = []
     for name, p in found.parameters.items():
-        message = f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), {p.physical_value:.3g} {p.physical_unit}'
+        message = (f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), '
+                   f'{measured(p.physical_value, p.physical_unit)}')
         if not p.identifiable:
             message += '; the trials could not tell it'
         statuses.append(_status(types, OK if p.identifiable else WARN, name, message, {

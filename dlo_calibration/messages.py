@@ -25,7 +25,7 @@ from typing import Any, Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.action import MAXIMUM_HANDS
+from dlo_calibration.action import MAXIMUM_HANDS, MAXIMUM_NORM, MINIMUM_NORM, quaternion_lengths
 from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.errors import InputError
 
@@ -40,6 +40,7 @@ NANOSECONDS = 10**9  # in a second
 MAXIMUM_POINTS = 10_000  # of a chain; a whole camera image sent by mistake has more
 MAXIMUM_WAYPOINTS = 100_000  # of an action
 MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more
+MINIMUM_STEP = 1e-6  # s between waypoints: what seconds since a stamp of another clock still tell apart
 MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start is longer
 INT8, UINT8, FLOAT32, FLOAT64 = 1, 2, 7, 8  # sensor_msgs/PointField
 FIELD_TYPES = {INT8: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32', 6: 'uint32',
@@ -149,16 +150,19 @@ class ActionMessage:
         if times[0] < 0 or times[-1] > MAXIMUM_DURATION:
             raise InputError(thing, f'time_from_start from {times[0]:g} to {times[-1]:g} s',
                              f'0 to {MAXIMUM_DURATION:g} s', 'count time_from_start from header.stamp')
-        bad = np.flatnonzero(np.diff(times) <= 0)
+        bad = np.flatnonzero(np.diff(times) < 0.999 * MINIMUM_STEP)
         if len(bad):
             k = bad[0]
             raise InputError(
-                thing, f'time_from_start {times[k + 1]:g} s of trajectory point {k + 1} after {times[k]:g} s',
-                'increasing times', 'sort the points and leave out repeated ones')
+                thing,
+                f'time_from_start {times[k + 1]:.9g} s of trajectory point {k + 1} after {times[k]:.9g} s',
+                f'increasing times, by {MINIMUM_STEP:g} s at least',
+                'sort the points and leave out repeated ones')
         # one bound with Hand, which normalises
-        norms = np.linalg.norm(orientations, axis=2)
-        if (norms < 0.5).any():
-            k, h = np.argwhere(norms < 0.5)[0]
+        norms = quaternion_lengths(orientations)
+        wrong = np.argwhere((norms < MINIMUM_NORM) | (norms > MAXIMUM_NORM))
+        if len(wrong):
+            k, h = wrong[0]
             raise InputError(
                 thing, f'a quaternion of length {norms[k, h]:g} for {names[h]} in trajectory point {k}',
                 'a unit quaternion x y z w', 'use 0 0 0 1 for a hand that does not turn')

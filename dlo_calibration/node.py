@@ -22,6 +22,7 @@ and the node stays.
 
 from __future__ import annotations
 
+from collections import deque
 import functools
 import sys
 import time
@@ -42,16 +43,20 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from dlo_calibration import diagnostics, messages
 from dlo_calibration.calibration import CalibrationResult, Evaluation
-from dlo_calibration.collector import TrialCollector
+from dlo_calibration.collector import KEPT, TrialCollector
 from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.recorder import Recorder
 from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
@@ -68,7 +73,9 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 OUTPUTS = {
     'progress': (DiagnosticArray, QoSProfile(depth=10)),
     'result': (DiagnosticArray, LATCHED),
+    'dlo_description': (String, LATCHED),
     'status': (DiagnosticArray, LATCHED),
+    'markers': (MarkerArray, LATCHED),
 }
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')  # declared by rclpy
 
@@ -77,7 +84,10 @@ ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownRO
 
 TICK = 0.05  # s between two looks at the worker
 PROGRESS_PERIOD = 0.1  # s between two progress messages, at least
+MARKERS_PERIOD = 1.0  # s between two messages of markers while trials come in, at least
+MARKERS_SHARE = 0.1  # s more of it per trial, so that a long session is not recorded again and again
 QUIET = 0.5  # s without action or goal chain, until a last trial counts as complete for start_after_trials
+WAIT = 'wait for it, or call ~/stop first'
 DEFECT = 'this is a defect of dlo_calibration, please report it'
 PATIENCE = 10.0  # s that the end waits for the worker
 
@@ -192,6 +202,16 @@ class CalibratorNode(Node):
         self.add_pre_set_parameters_callback(_as_declared)
         self.add_on_set_parameters_callback(self._check_parameters)
 
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters together, as `rclpy.node.Node` does; what is refused is told as a message is."""
+        try:
+            _checked({**self.options().flat(), **{
+                p.name: _plain(p.value) for p in parameter_list if not p.name.startswith(ROS_PARAMETERS)}})
+        except InputError as error:
+            self._refuse(str(error))
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(parameter_list)
+
     def _check_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changed = {p.name: _plain(p.value) for p in parameters if p.name in DECLARED}
         try:
@@ -237,6 +257,7 @@ class CalibratorNode(Node):
         self._record(kind, INPUT_TYPES[kind], octets)
         if kind != INITIAL:
             self._last_heard = time.monotonic()
+            self._unseen = True
         try:
             try:
                 message = deserialize_message(octets, INPUTS[kind][0])
@@ -244,6 +265,8 @@ class CalibratorNode(Node):
                 raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
                                  'check what publishes it') from error
             self._collector.add(messages.read(kind, message))
+            for refusal in self._collector.take_news():
+                self._refuse(str(refusal))
         except InputError as error:
             self._refuse(str(error))
         except Exception as error:  # a defect of ours must not take the session with it
@@ -254,6 +277,7 @@ class CalibratorNode(Node):
 
     def _refuse(self, text: str) -> None:
         self._last_refusal = text
+        self._told.append(text)
         self._warn(text)
         self._report()
 
@@ -267,22 +291,25 @@ class CalibratorNode(Node):
             response.message, response.success = str(error), False
         except Exception as error:
             response.message, response.success = f'{error!r}; {DEFECT}', False
-        if not response.success:
-            self._warn(response.message)
-        self._report()
+        if response.success:
+            self._report()
+        else:
+            self._refuse(response.message)
         return response
 
     def _start(self) -> str:
         if self._calibrating is not None:
-            raise DloCalibrationError('a calibration is under way; wait for it, or call ~/stop first')
+            raise InputError('~/start', 'a calibration under way', 'none', WAIT)
         for kind, subscription in self._inputs.items():
             self._empty(kind, subscription)  # sent before the request, so it belongs to it
         options = self.options()
         if options != self._collected_with:
             self._collector = self._collector.with_options(options)
             self._collected_with = options
+        told = set(self._told)
         for problem in self._collector.problems:
-            self._warn(str(problem))
+            if str(problem) not in told:
+                self._refuse(str(problem))
         trials = self._collector.trials
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
@@ -296,25 +323,29 @@ class CalibratorNode(Node):
 
     def _stop(self) -> str:
         if self._calibrating is None:
-            raise DloCalibrationError('no calibration is under way')
+            raise InputError('~/stop', 'no calibration under way', 'one', 'call ~/start first')
         self._worker.stop()
         return 'the search ends now; the best so far will be the result'
 
     def _reset(self) -> str:
         if self._calibrating is not None:
-            raise DloCalibrationError('a calibration is under way; call ~/stop first')
+            raise InputError('~/reset', 'a calibration under way', 'none', WAIT)
         self._recorder.end()
         self._collected_with = self.options()
         self._collector = TrialCollector(self._collected_with)
         self._forget()
         self._begin_session()
+        self._show()
         return 'the trials are forgotten'
 
     def _forget(self) -> None:
         self._state, self._detail, self._last_refusal = 'collecting', '', ''
+        self._told: deque[str] = deque(maxlen=KEPT)  # refusals
         self._last_heard = 0.0  # when the last action or goal chain came
         self._started_by_itself = False
         self._reported: dict[str, Any] = {}
+        self._found: CalibrationResult | None = None
+        self._unseen, self._seen = False, 0.0  # trials that the markers do not show yet; when they were sent
 
     # The worker's events
 
@@ -323,6 +354,7 @@ class CalibratorNode(Node):
             self._hear_best_effort()
             self._take_events()
             self._start_by_itself()
+            self._show_new()
             self._report()
         except Exception as error:  # a callback that raises would end the node
             self._state, self._detail = 'failed', f'{error!r}; {DEFECT}'
@@ -377,8 +409,12 @@ class CalibratorNode(Node):
         for warning in event.warnings:
             self._warn(warning)
         self._send('result', diagnostics.result(self._types, event, self._now()))
+        self._send('dlo_description', self._types.build('std_msgs/msg/String', data=description_document(
+            event, None if options is None else options.flat()).decode()))
         if options is not None:
             self._recorder.result(event, options)
+        self._found = event
+        self._show()
         self._report()
 
     # Messages out
@@ -391,6 +427,17 @@ class CalibratorNode(Node):
         if content != self._reported:
             self._reported = content
             self._send('status', diagnostics.status(self._types, stamp=self._now(), **content))
+
+    def _show_new(self) -> None:
+        """Send the markers of trials that came in since the last time, not too often."""
+        period = MARKERS_PERIOD + MARKERS_SHARE * self._collector.count
+        if self._unseen and self._collector.count and time.monotonic() - self._seen >= period:
+            self._show()
+
+    def _show(self) -> None:
+        self._unseen, self._seen = False, time.monotonic()
+        self._send('markers', markers(self._types, self._collector.trials, stamp=self._now(),
+                                      frame_id=self._collector.frame_id, result=self._found))
 
     def _send(self, name: str, message: Any) -> None:
         octets = serialize_message(message)

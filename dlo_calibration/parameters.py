@@ -87,6 +87,11 @@ BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in P
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 
 
+def measured(value: float, unit: str) -> str:
+    """Return a physical value as people write it; a coefficient has no unit."""
+    return f'{value:.3g}' if unit == '1' else f'{value:.3g} {unit}'
+
+
 @dataclass(frozen=True)
 class ParameterSpace:
     """

@@ -23,10 +23,10 @@ from typing import Callable
 
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.config import Options
+from dlo_calibration.description import write_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.recording import RecordingError, SessionWriter
 from dlo_calibration.report import write_evaluations
-from dlo_calibration.xml import write_result
 
 
 class Recorder:

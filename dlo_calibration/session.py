@@ -127,13 +127,19 @@ class Session:
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
     """Return the complete trials of a session, and why messages are not used."""
     collector = TrialCollector(options)
-    refusals = []
+    usable, refusals = [], []
     for kind, message in session.messages:
         try:
-            collector.add(read(kind, message))
+            usable.append(read(kind, message))
         except InputError as error:
             refusals.append(str(error))
-    refusals += [str(problem) for problem in collector.problems]
+    for one in sorted(usable, key=lambda one: one.stamp):  # the trials do not depend on the order of arrival
+        try:
+            collector.add(one)
+        except InputError as error:
+            refusals.append(str(error))
+        refusals += [str(refusal) for refusal in collector.take_news()]
+    refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
     return collector.trials, tuple(dict.fromkeys(refusals))
 
 
@@ -326,11 +332,23 @@ class _Source:
             except ValueError:
                 options = None
             if isinstance(options, dict):
-                self.options = options
+                self.options = self._usable(options)
             else:
                 self.problems.append('recorded options that cannot be read are left out')
         if 'mark' in entries:
             self.marks.append((entries['mark'], len(self.records)))
+
+    def _usable(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the options that this version knows and accepts."""
+        usable = {}
+        for name, value in options.items():
+            try:
+                Options.of({name: value})
+            except InputError as error:
+                self.problems.append(f'a recorded option is left out: {error}')
+            else:
+                usable[name] = value
+        return usable
 
     def _ended(self, path: Path, before: int, error: Exception) -> None:
         """Note where reading ended; nothing read at all is an error."""

@@ -24,6 +24,8 @@ from dlo_calibration.action import Action, Hand
 from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.errors import InputError
 
+INSTANTS = 5  # goals shown at most where a trial has many
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -110,3 +112,8 @@ class Trial:
         if goal.time <= hand.end:
             return goal.time >= hand.start
         return hand.name in goal.held_by
+
+
+def shown_goals(count: int) -> list[int]:
+    """Return the indices of the goals to show of `count`: evenly spread, the last one always."""
+    return sorted({int(k) for k in np.linspace(count - 1, 0, min(count, INSTANTS)).round()})

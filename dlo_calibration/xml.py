@@ -14,324 +14,299 @@
 
 
 """
-Result file: what a calibration found, as an XML document.
+XML: documents read safely, checked by their schema, and written canonically.
 
-Numbers are written so that reading gives the same floating-point values.  A
-document is read by a parser that fetches nothing and expands no entities, and
-anything in it that is not expected is refused.
+A document is UTF-8.  A document type declaration, an entity, a namespace (which
+could name a schema elsewhere), a processing instruction, and more bytes, depth or
+elements than a document of ours has are refused before anything is made of them;
+nothing is fetched.  Comments are allowed, and not kept.
+
+Written is one form only: attributes in the order of the schema, two blanks a
+level, numbers by their shortest text that reads back as the same number.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
-import json
+from importlib.resources import as_file, files
 import math
 from pathlib import Path
 import re
-from types import MappingProxyType
-from typing import Any, Mapping
+from typing import Any, Iterator, Mapping
 
 from lxml import etree
+import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
 from dlo_calibration.chain import Chain, Floats
+from dlo_calibration.config import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.score import PointErrors
 
-VERSION = '1'
-ROOT = 'calibration_result'
-MAXIMUM_SIZE = 64 * 2**20  # bytes; a result takes some kilobytes
+VERSION = '1'  # of both kinds of document
+MAXIMUM_SIZE = 64 * 2**20  # bytes
+MAXIMUM_ELEMENTS = 1_000_000
+MAXIMUM_DEPTH = 16
+PIECE = 2**16  # bytes that are parsed at once
 NOT_XML = re.compile('[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
+DECLARATION = re.compile(b'<!(DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)')
 
-ESTIMATE_NUMBERS = ('value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')
-ERROR_NUMBERS = tuple(one.name for one in fields(PointErrors))
-
-#: Each element's attributes, and the elements in it.
-LAYOUT: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    ROOT: (('version',), ('dlo', 'parameters', 'search', 'fit', 'options', 'warnings')),
-    'dlo': (('mass', 'length'), ('point',)),
-    'point': (('x', 'y', 'z'), ()),
-    'parameters': ((), ('parameter', 'fixed')),
-    'parameter': (('name', *ESTIMATE_NUMBERS, 'physical_unit', 'identifiable'), ()),
-    'fixed': (('name', 'value'), ()),
-    'search': (('name', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason'), ()),
-    'fit': (('score', *ERROR_NUMBERS), ('trial',)),
-    'trial': (('name', 'score'), ()),
-    'options': ((), ('option',)),
-    'option': (('name', 'value'), ()),
-    'warnings': ((), ('warning',)),
-    'warning': (('text',), ()),
-}
+#: What the patterns of the schemas mean, by how they begin.
+PATTERNS = {'[+': 'a finite number', '-?': 'an integer', '\\S': 'a name without blanks'}
 
 
-@dataclass(frozen=True)
-class ResultFile:
+def read_octets(path: str | Path, what: str, suggestion: str) -> bytes:
     """
-    What a result file says.
+    Read a file that is not too large.
 
-    :param parameters: the found ones, in the order of the calibration.
-    :param fixed: values of others on the 0..100 scale; those not named keep their default.
-    :param mass: kg of the whole DLO; 0 where it was not known.
-    :param length: mean length of the DLO over the trials [m].
-    :param points: (n, 3) [m] the DLO at rest, before the first trial's action.
-    :param options: those in force, by name; empty where they were not given.
-    :param trials: names of the trials.
-    :param scores: difference score of each trial.
+    :raises InputError: where it cannot be read.
     """
-
-    parameters: Mapping[str, ParameterEstimate]
-    fixed: Mapping[str, float]
-    mass: float
-    length: float
-    points: Floats
-    score: float
-    trials: tuple[str, ...]
-    scores: tuple[float, ...]
-    errors: PointErrors
-    search: str
-    engine: str
-    seed: int | None
-    evaluations: int
-    simulations: int
-    seconds: float
-    stop_reason: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'points', Chain(self.points).points)
-        for name in ('parameters', 'fixed', 'options'):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-
-    @classmethod
-    def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> ResultFile:
-        """Return what the file of a result says."""
-        return cls(
-            parameters=result.parameters, mass=result.space.mass,
-            fixed={name: value for name, value in result.space.fixed.items()
-                   if name not in result.parameters},
-            length=result.length, points=result.trials[0].initial.points, score=result.best.score,
-            trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
-            errors=result.errors, search=result.search, engine=result.engine, seed=result.seed,
-            evaluations=len(result.evaluations), simulations=result.simulations, seconds=result.seconds,
-            stop_reason=result.stop_reason, options=options or {}, warnings=result.warnings)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Found parameters on the 0..100 scale, by name."""
-        return {name: estimate.value for name, estimate in self.parameters.items()}
-
-    @property
-    def space(self) -> ParameterSpace:
-        """The parameters that were found, and where the others stayed."""
-        return ParameterSpace(tuple(self.parameters), self.fixed, self.mass)
-
-    def physical(self) -> dict[str, float]:
-        """Every parameter's physical value in SI units, exactly as they were in the best evaluation."""
-        return self.space.physical(self.values, self.length)
+    where = f'{what} {path}'
+    try:
+        with Path(path).open('rb') as stream:
+            octets = stream.read(MAXIMUM_SIZE + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(where, str(error), suggestion, 'check the path') from error
+    return octets
 
 
-def result_document(result: CalibrationResult | ResultFile,
-                    options: Mapping[str, Any] | None = None) -> bytes:
-    """Return a result as an XML document in UTF-8."""
-    file = result if isinstance(result, ResultFile) else ResultFile.of(result, options)
-    root = etree.Element(ROOT, version=VERSION)
-    dlo = _add(root, 'dlo', mass=file.mass, length=file.length)
-    for x, y, z in file.points:
-        _add(dlo, 'point', x=x, y=y, z=z)
-    parameters = _add(root, 'parameters')
-    for estimate in file.parameters.values():
-        _add(parameters, 'parameter', **asdict(estimate))
-    for name, value in file.fixed.items():
-        _add(parameters, 'fixed', name=name, value=value)
-    _add(root, 'search', name=file.search, engine=file.engine, seed=file.seed, evaluations=file.evaluations,
-         simulations=file.simulations, seconds=file.seconds, stop_reason=file.stop_reason)
-    fit = _add(root, 'fit', score=file.score, **asdict(file.errors))
-    for name, score in zip(file.trials, file.scores, strict=True):
-        _add(fit, 'trial', name=name, score=score)
-    chosen = _add(root, 'options')
-    for name, value in sorted(file.options.items()):
-        _add(chosen, 'option', name=name, value=json.dumps(value))
-    warnings = _add(root, 'warnings')
-    for text in file.warnings:
-        _add(warnings, 'warning', text=text)
+def parse(octets: bytes, where: str, schema: str) -> Any:
+    """
+    Return the root element of a document that agrees with a schema.
+
+    :param where: names the document in refusals, e.g. ``file result.xml``.
+    :param schema: name of the schema, which is that of the root element.
+    :raises InputError: which names the line and what is wrong there.
+    """
+    _check_octets(octets, where)
+    parser = etree.XMLPullParser(
+        events=('start', 'end', 'pi'), encoding='utf-8', resolve_entities=False, no_network=True,
+        load_dtd=False, dtd_validation=False, attribute_defaults=False, huge_tree=False, remove_comments=True)
+    guard = _Guard(where)
+    try:
+        for begin in range(0, len(octets), PIECE):
+            parser.feed(octets[begin:begin + PIECE])
+            guard.check(parser.read_events())
+        root = parser.close()
+    except (etree.XMLSyntaxError, ValueError, AssertionError) as error:
+        guard.check(parser.read_events())
+        line, text = next(((entry.line, entry.message) for entry in parser.feed_error_log),
+                          (0, str(error)))
+        raise InputError(f'{where}, line {line}' if line else where, f'no XML document ({_short(text)})',
+                         f'a document <{schema}>', 'write it again') from error
+    guard.check(parser.read_events())
+    if root.tag != schema:
+        raise refused(where, root, f'the root element <{root.tag}>', f'<{schema}>', f'name a <{schema}> file')
+    checker = _schema(schema)
+    if not checker.validate(root):
+        raise _schema_error(where, checker.error_log[0], schema)
+    return root
+
+
+def document(root: Any) -> bytes:
+    """Return an element as a document."""
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding='UTF-8')) + b'\n'
 
 
-def write_result(path: str | Path, result: CalibrationResult | ResultFile,
-                 options: Mapping[str, Any] | None = None) -> None:
+def write_octets(path: str | Path, octets: bytes, what: str) -> None:
     """
-    Write a result, and the options in force, to an XML file.
+    Write a document to a file.
 
     :raises InputError: where the file cannot be written.
     """
-    document = result_document(result, options)
     try:
-        Path(path).write_bytes(document)
+        Path(path).write_bytes(octets)
     except OSError as error:
-        raise InputError(f'result file {path}', str(error), 'a place that can be written to',
+        raise InputError(f'{what} {path}', str(error), 'a place that can be written to',
                          'choose another output directory') from error
 
 
-def read_result(path: str | Path) -> ResultFile:
-    """
-    Read a result file.
-
-    :raises InputError: where it cannot be read, or is not such a document;
-        the text names the element.
-    """
-    where = f'result file {path}'
-    try:
-        with Path(path).open('rb') as stream:
-            text = stream.read(MAXIMUM_SIZE + 1)
-    except (OSError, ValueError) as error:
-        raise InputError(where, str(error), 'a result.xml', 'check the path') from error
-    if len(text) > MAXIMUM_SIZE:
-        raise InputError(where, f'more than {MAXIMUM_SIZE} bytes', 'a result.xml', 'check the path')
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, dtd_validation=False,
-                             huge_tree=False, remove_comments=True)
-    try:
-        root = etree.fromstring(text, parser)
-    except (etree.XMLSyntaxError, ValueError) as error:
-        raise InputError(where, f'no XML document ({error})', 'a result.xml as this package writes it',
-                         'write it again') from error
-    if root.getroottree().docinfo.doctype:
-        raise InputError(where, 'a document type declaration', 'a document without one',
-                         'remove the <!DOCTYPE ...>')
-    return _Reading(where).result(root)
+def refused(where: str, element: Any, came: str, expected: str,
+            remedy: str = 'correct the file') -> InputError:
+    """Return the error about an element."""
+    line = f', line {element.sourceline}' if element.sourceline else ''
+    return InputError(f'{where}{line}, element <{element.tag}>', came, expected, remedy)
 
 
-def _add(parent: Any, tag: str, **attributes: Any) -> Any:
-    return etree.SubElement(parent, tag, {name: _text(value) for name, value in attributes.items()})
+def new_root(tag: str) -> Any:
+    """Return the root element of a new document."""
+    return etree.Element(tag, version=VERSION)
 
 
-def _text(value: Any) -> str:
+def add(parent: Any, tag: str, **attributes: Any) -> Any:
+    """Add an element; attributes that are None are left out."""
+    return etree.SubElement(parent, tag, {name: text_of(value) for name, value in attributes.items()
+                                          if value is not None})
+
+
+def text_of(value: Any) -> str:
     """Return a value as text from which it can be read back exactly."""
-    if value is None:
-        return 'none'
     if isinstance(value, bool):
         return 'true' if value else 'false'
+    if isinstance(value, (tuple, list)):
+        return ' '.join(text_of(one) for one in value)
     if isinstance(value, (int, str)):
         return NOT_XML.sub('\ufffd', str(value))
     return repr(float(value))
 
 
-class _Reading:
-    """Reads a document's elements; every refusal names the element."""
+def number(where: str, element: Any, name: str) -> float:
+    """Return an attribute that the schema calls a number."""
+    return finite(where, element, name, element.get(name))
+
+
+def finite(where: str, element: Any, name: str, text: str) -> float:
+    """Return a text that the schema calls a number, of the attribute `name`."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise refused(where, element, f'{name} {text!r}', 'a number below 1.8e308')
+    return value
+
+
+def add_chain(parent: Any, tag: str, chain: Chain, **attributes: Any) -> Any:
+    """Add a chain with its annotations."""
+    element = add(parent, tag, **attributes)
+    hands = [None] * len(chain) if chain.hands is None else chain.hands.tolist()
+    for (x, y, z), hand, feature in zip(chain.points.tolist(), hands, chain.features.tolist(), strict=True):
+        add(element, 'point', x=x, y=y, z=z, hand=hand, feature=feature or None)
+    return element
+
+
+def read_chain(where: str, element: Any) -> Chain:
+    """Return the chain whose points are in an element."""
+    annotated = [point.get('hand') for point in element]
+    if None in annotated and any(hand is not None for hand in annotated):
+        point = element[annotated.index(None)]
+        raise refused(where, point, "no attribute 'hand'", 'it at all points of the chain, or at none')
+    try:
+        return Chain(read_vectors(where, element),
+                     None if None in annotated else np.array([int(hand) for hand in annotated], np.uint8),
+                     np.array([point.get('feature') == 'true' for point in element]))
+    except InputError as error:
+        if error.thing.startswith(where):
+            raise
+        raise refused(where, element, error.came, error.expected, error.remedy) from error
+
+
+def read_vectors(where: str, element: Any) -> Floats:
+    """Return the x y z of the elements in an element, (n, 3)."""
+    return np.array([[number(where, one, axis) for axis in 'xyz'] for one in element], dtype=float)
+
+
+def add_options(parent: Any, tag: str, flat: Mapping[str, Any]) -> None:
+    """Add options by name, in the order of their declarations."""
+    element = add(parent, tag)
+    for declaration in declarations():
+        if declaration.name in flat:
+            add(element, 'option', name=declaration.name, value=flat[declaration.name])
+
+
+def read_options(where: str, element: Any) -> dict[str, Any]:
+    """Return options by name, each checked by its declaration."""
+    known = {declaration.name: declaration for declaration in declarations()}
+    found: dict[str, Any] = {}
+    for option in element:
+        name, text = option.get('name'), option.get('value')
+        if name in found:
+            raise refused(where, option, f'the name {name!r} twice', 'each name once')
+        try:
+            found[name] = _option(known[name], text) if name in known else None
+            Options.of({name: found[name]})
+        except InputError as error:
+            raise refused(where, option, f'{error.thing}: {error.came}', error.expected,
+                          error.remedy) from error
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+
+def _option(declaration: Declaration, text: str) -> Any:
+    kind = type(declaration.default)
+    try:
+        if kind is bool:
+            return {'true': True, 'false': False}[text]
+        if kind is tuple:
+            return tuple(text.split())
+        return kind(text)
+    except (KeyError, ValueError):
+        return declaration.checked(text)  # says which type it should have
+
+
+class _Guard:
+    """Looks at a document as it grows."""
 
     def __init__(self, where: str) -> None:
         self._where = where
+        self._depth = 0
+        self._count = 0
 
-    def result(self, root: Any) -> ResultFile:
-        if root.tag != ROOT:
-            raise self._refused(root, f'<{root.tag}>', f'<{ROOT}>', 'name a result.xml')
-        if root.get('version') != VERSION:
-            raise self._refused(root, f'version {root.get("version")!r}', f'version {VERSION!r}',
-                                'read it with the version of this package that wrote it')
-        self._check(root)
-        dlo, parameters, search, fit, options, warnings = (self._child(root, tag) for tag in LAYOUT[ROOT][1])
-        seed = search.get('seed')
-        estimates = self._named(parameters, 'parameter', self._estimate)
-        for fixed in parameters.findall('fixed'):
-            if fixed.get('name') in estimates:
-                raise self._refused(fixed, f'{fixed.get("name")!r}, which is a found parameter too', 'either')
-        try:
-            file = ResultFile(
-                parameters=estimates,
-                fixed=self._named(parameters, 'fixed', lambda one: self._number(one, 'value')),
-                mass=self._number(dlo, 'mass'), length=self._number(dlo, 'length'),
-                points=[[self._number(point, axis) for axis in 'xyz'] for point in dlo],  # type: ignore
-                score=self._number(fit, 'score'),
-                trials=tuple(trial.get('name') for trial in fit),
-                scores=tuple(self._number(trial, 'score') for trial in fit),
-                errors=PointErrors(**{name: self._number(fit, name) for name in ERROR_NUMBERS}),
-                search=search.get('name'), engine=search.get('engine'),
-                seed=None if seed == 'none' else self._integer(search, 'seed'),
-                evaluations=self._integer(search, 'evaluations'),
-                simulations=self._integer(search, 'simulations'), seconds=self._number(search, 'seconds'),
-                stop_reason=search.get('stop_reason'), options=self._named(options, 'option', self._json),
-                warnings=tuple(warning.get('text') for warning in warnings))
-            file.space.point(file.values)
-        except InputError as error:
-            if error.thing.startswith(self._where):
-                raise
-            raise InputError(f'{self._where}: {error.thing}', error.came, error.expected,
-                             error.remedy) from error
-        if not file.mass >= 0 or not file.length > 0:
-            raise self._refused(dlo, f'mass {file.mass:g} kg, length {file.length:g} m',
-                                'a mass of 0 or more, a length above 0', 'correct them')
-        return file
+    def check(self, events: Iterator[tuple[str, Any]]) -> None:
+        """Refuse what no document of ours has."""
+        for event, element in events:
+            if event == 'end':
+                self._depth -= 1
+                continue
+            if event == 'pi':
+                raise InputError(f'{self._where}, line {element.sourceline}',
+                                 f'a processing instruction <?{_short(element.target)}?>', 'none',
+                                 'remove it')
+            self._depth += 1
+            self._count += 1
+            if self._depth > MAXIMUM_DEPTH:
+                raise refused(self._where, element, f'more than {MAXIMUM_DEPTH} elements in each other',
+                              'a document as this package writes it')
+            if self._count > MAXIMUM_ELEMENTS:
+                raise refused(self._where, element, f'more than {MAXIMUM_ELEMENTS} elements', 'fewer',
+                              'use several files')
+            for name in (element.tag, *element.attrib):
+                if name.startswith('{'):
+                    raise refused(self._where, element, f'{_short(name)}, which is in a namespace',
+                                  'names without a namespace', 'remove it')
 
-    def _refused(self, element: Any, came: str, expected: str,
-                 remedy: str = 'correct the file') -> InputError:
-        line = f', line {element.sourceline}' if element.sourceline else ''
-        return InputError(f'{self._where}, element <{element.tag}>{line}', came, expected, remedy)
 
-    def _check(self, element: Any) -> None:
-        """Refuse what the layout does not name, here and below."""
-        attributes, children = LAYOUT[element.tag]
-        for name in element.attrib:
-            if name not in attributes:
-                raise self._refused(element, f'attribute {name!r}', f'only {", ".join(attributes) or "none"}')
-        for name in attributes:
-            if name not in element.attrib:
-                raise self._refused(element, f'no attribute {name!r}', f'{", ".join(attributes)}')
-        if (element.text or '').strip():
-            raise self._refused(element, f'text {element.text.strip()[:40]!r}', 'no text')
-        for child in element:
-            if child.tag not in children:
-                name = f'<{child.tag}>' if isinstance(child.tag, str) else str(child)
-                raise self._refused(element, name,
-                                    ', '.join(f'<{tag}>' for tag in children) or 'nothing in it')
-            if (child.tail or '').strip():
-                raise self._refused(element, f'text {child.tail.strip()[:40]!r}', 'no text')
-            self._check(child)
+def _check_octets(octets: bytes, where: str) -> None:
+    if len(octets) > MAXIMUM_SIZE:
+        raise InputError(where, f'more than {MAXIMUM_SIZE} bytes', 'a smaller document', 'use several files')
+    try:
+        octets.decode('utf-8')
+    except UnicodeDecodeError as error:
+        raise InputError(f'{where}, line {_line(octets, error.start)}', 'bytes that are not UTF-8', 'UTF-8',
+                         'save it in this encoding') from error
+    declared = DECLARATION.search(octets)
+    if declared:
+        raise InputError(f'{where}, line {_line(octets, declared.start())}',
+                         f'a document type declaration ({declared[0].decode()} ...)',
+                         'a document without one', 'remove it')
 
-    def _child(self, element: Any, tag: str) -> Any:
-        found = element.findall(tag)
-        if len(found) != 1:
-            raise self._refused(element, f'{len(found)} elements <{tag}>', 'one')
-        return found[0]
 
-    def _named(self, parent: Any, tag: str, value: Any) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for element in parent.findall(tag):
-            name = element.get('name')
-            if name in found:
-                raise self._refused(element, f'the name {name!r} twice', 'each name once')
-            found[name] = value(element)
-        return found
+def _line(octets: bytes, place: int) -> int:
+    return octets.count(b'\n', 0, place) + 1
 
-    def _estimate(self, element: Any) -> ParameterEstimate:
-        numbers = {name: self._number(element, name) for name in ESTIMATE_NUMBERS}
-        if not 0 <= numbers['value'] <= 100:
-            raise self._refused(element, f'value {numbers["value"]:g}', '0 to 100')
-        identifiable = element.get('identifiable')
-        if identifiable not in ('true', 'false'):
-            raise self._refused(element, f'identifiable {identifiable!r}', "'true' or 'false'")
-        return ParameterEstimate(name=element.get('name'), physical_unit=element.get('physical_unit'),
-                                 identifiable=identifiable == 'true', **numbers)
 
-    def _number(self, element: Any, name: str) -> float:
-        text = element.get(name)
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            raise self._refused(element, f'{name} {text[:40]!r}', 'a finite number')
-        return number
+def _short(text: str) -> str:
+    text = ' '.join(text.split())
+    return text if len(text) <= 200 else f'{text[:200]} ...'
 
-    def _integer(self, element: Any, name: str) -> int:
-        text = element.get(name)
-        if not re.fullmatch('-?[0-9]{1,18}', text):
-            raise self._refused(element, f'{name} {text[:40]!r}', 'an integer')
-        return int(text)
 
-    def _json(self, element: Any) -> Any:
-        try:
-            return json.loads(element.get('value'))
-        except (ValueError, RecursionError) as error:
-            raise self._refused(element, f'value {element.get("value")[:40]!r}', 'a JSON value') from error
+def _schema(name: str) -> Any:
+    with as_file(files('dlo_calibration') / 'schema') as folder:
+        return etree.XMLSchema(etree.parse(str(folder / f'{name}.xsd')))
+
+
+def _schema_error(where: str, entry: Any, schema: str) -> InputError:
+    """Return the first thing that a schema does not allow, as a refusal."""
+    expected = f'a document that {schema}.xsd allows'
+    found = re.match(r"Element '([^']*)'(?:, attribute '([^']*)')?: (.*)", ' '.join(entry.message.split()))
+    if found is None:
+        return InputError(f'{where}, line {entry.line}', _short(entry.message), expected, 'correct the file')
+    tag, attribute, text = found.groups()
+    text = re.sub(r'^\[facet .*?\] ', '', text)
+    for pattern, wanted in (
+            (r"The value '(.*)' is not accepted by the pattern '(..).*", None),
+            (r"(The value '.*' is not) an element of the set \{(.*)\}\.", 'one of {}'),
+            (r"('.*' is not a valid value) of the (?:\w+) type '(.*)'\.", 'a value of the type {}'),
+            (r'(.*) Expected is (?:one of )?\( (.*) \)\.', '{}')):
+        match = re.fullmatch(pattern, text)
+        if match:
+            text = match[1] if wanted else repr(match[1])
+            expected = wanted.format(match[2]) if wanted else PATTERNS.get(match[2], expected)
+            break
+    came = f'attribute {attribute!r}: {text}' if attribute else text
+    return InputError(f'{where}, line {entry.line}, element <{tag}>', _short(came.rstrip('.')),
+                      _short(expected), 'correct the file')

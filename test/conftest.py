@@ -14,13 +14,27 @@
 
 """Fixtures that several test modules share."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
 import itertools
+import json
 import os
+from pathlib import Path
+import shutil
 import socket
+import subprocess
+import sys
 
 import pytest
+from toy_simulator import ToySimulator
 from wire import SOURCES
+
+from dlo_calibration import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'dlo_calibration'
+FOLDERS = (NAME, 'config', 'launch', 'msg_samples', 'resource')  # of what is installed
 
 # Above 101 the ports of a domain fall into the range that Linux gives to any program.
 # https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html
@@ -40,24 +54,87 @@ def _unused(domain: int) -> bool:
     return True
 
 
-@pytest.fixture
-def ros_environment(monkeypatch: pytest.MonkeyPatch, tmp_path) -> Mapping[str, str]:
+@contextmanager
+def ros_graph(folder) -> Iterator[Mapping[str, str]]:
     """
-    Give a ROS graph of the test's own, on this machine alone.
+    Give a ROS graph of its own, on this machine alone, which logs into `folder`.
 
-    It holds for the test's process, and for a child that gets the returned
-    environment.
+    It holds for this process, and for a child that gets the returned environment.
     """
     domains = (1 + turn % DOMAINS for turn in itertools.islice(_turns, DOMAINS))
     domain = next(filter(_unused, domains))
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
-    monkeypatch.delenv('ROS_STATIC_PEERS', raising=False)
-    return dict(os.environ)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(domain))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.setenv('ROS_LOG_DIR', str(folder / 'ros_log'))
+        patch.delenv('ROS_STATIC_PEERS', raising=False)
+        yield dict(os.environ)
+
+
+@pytest.fixture
+def ros_environment(tmp_path) -> Iterator[Mapping[str, str]]:
+    """Give a ROS graph of the test's own."""
+    with ros_graph(tmp_path) as environment:
+        yield environment
+
+
+@pytest.fixture(scope='module')
+def shared_ros_environment(tmp_path_factory) -> Iterator[Mapping[str, str]]:
+    """Give a ROS graph to the tests of one module together."""
+    with ros_graph(tmp_path_factory.mktemp('graph')) as environment:
+        yield environment
 
 
 @pytest.fixture(params=SOURCES)
 def types(request):
     """Give the message classes of either source."""
     return SOURCES[request.param]()
+
+
+@pytest.fixture(scope='session')
+def sources(tmp_path_factory):
+    """Copy the sources, so that a build leaves nothing in the repository."""
+    copy = tmp_path_factory.mktemp('workspace') / 'src'
+    copy.mkdir()
+    for name in FOLDERS:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns('__pycache__'))
+    for file in ROOT.glob('*.*'):
+        if file.is_file():
+            shutil.copy(file, copy)
+    shutil.copy(ROOT / 'LICENSE', copy)
+    return copy
+
+
+@pytest.fixture(scope='session')
+def install(sources):
+    """Build with colcon and return the folder `install` of the workspace."""
+    if find_spec('colcon_core') is None or find_spec('colcon_ros') is None:
+        pytest.skip('colcon is not installed; the extra "test" of setup.py has it')
+    workspace = sources.parent
+    done = subprocess.run(
+        [sys.executable, '-W', 'ignore', '-m', 'colcon', '--log-base', 'log', 'build'],
+        cwd=workspace, capture_output=True, text=True)
+    assert done.returncode == 0, f'{done.stdout}{done.stderr}'
+    return workspace / 'install'
+
+
+@pytest.fixture(scope='session')
+def prefix(install):
+    """Return where the package is installed."""
+    return install / NAME
+
+
+@pytest.fixture
+def command(capsys):
+    """Give a function that does what a command line says, with the toy: its code, JSON, lines on stderr."""
+    def act(*words):
+        capsys.readouterr()
+        try:
+            code = cli.main([str(word) for word in words], lambda _: ToySimulator())
+        except SystemExit as end:  # argparse
+            code = end.code
+        output, errors = capsys.readouterr()
+        return code, json.loads(output) if output else None, errors.splitlines()
+
+    return act

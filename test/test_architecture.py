@@ -27,15 +27,16 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 #: A module imports only from those before it; the modules of a subpackage share its place.
 ORDER = (
     # pure NumPy and SciPy
-    'errors', 'chain', 'action', 'trial', 'parameters', 'simulator', 'score', 'search', 'uncertainty',
-    'calibration', '__init__', 'config',
+    'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score', 'search',
+    'uncertainty', 'calibration', '__init__', 'config', 'parameter_file',
     # messages and files
-    'messages', 'diagnostics', 'segment', 'collector', 'recording', 'xml', 'session',
+    'messages', 'diagnostics', 'markers', 'segment', 'collector', 'recording', 'xml', 'description',
+    'request', 'session',
     # engines
     'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',
     # edges
-    'pool', 'worker', 'picture', 'terminal', 'report', 'signals', 'recorder', 'node', 'calibrator', 'cli',
-    '__main__', 'demo',
+    'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder', 'node',
+    'calibrator', 'cli', '__main__', 'demo',
 )
 
 #: The only modules that may import something, be it at the top or inside a function.

@@ -384,9 +384,20 @@ def test_messages_stamped_before_every_initial_chain_are_refused():
     for message in (action(2), goal(3)):
         text = refused(collector, message)
         assert f'no initial_chain before it, expected one stamped earlier (the first is {initial(5)})' in text
-    assert [p.thing for p in collector.problems] == [str(action(2))]
+    assert (collector.problems, collector.take_news()) == ((), ())
     collector.add(initial(1))
     assert (collector.count, collector.problems) == (1, ())
+
+
+def test_what_waited_is_refused_together_when_the_first_initial_chain_is_later():
+    collector = collect(goal(2), action(2.5), goal(4))
+    assert collector.take_news() == ()
+    collector.add(initial(5))
+    refusal, = collector.take_news()
+    assert str(refusal).startswith(f'{goal(2)} and 2 more: got no initial_chain before them')
+    assert collector.take_news() == ()
+    collector.add(initial(1))  # late, but the refused messages are used after all
+    assert (collector.count, collector.take_news()) == (1, ())
 
 
 # ---- what status tells
@@ -410,6 +421,30 @@ def test_trial_that_the_next_one_cuts_off_is_a_problem():
     assert f'no goal_chain between {action(2)} and {initial(3)}' in str(problem)
     collector.add(goal(2.5))
     assert (collector.problems, collector.count) == ((), 1)
+
+
+def test_goals_without_action_that_the_next_trial_cuts_off_are_a_problem():
+    collector = collect(initial(1), goal(2), goal(2.5), initial(3))
+    problem, = collector.problems
+    assert f'2 goal_chain, but no action between {initial(1)} and {initial(3)}' in str(problem)
+    assert collector.loose_end == ()
+
+
+@pytest.mark.parametrize(('messages', 'words'), [
+    ([goal(2), goal(3)], 'there is none'),
+    ([initial(1), goal(2)], '1 goal_chain, but no action'),
+    ([initial(1), action(2)], f'no goal_chain between {action(2)} and the end'),
+])
+def test_trial_that_the_end_cuts_off_is_a_loose_end(messages, words):
+    collector = collect(*messages)
+    problem, = collector.loose_end
+    assert words in str(problem)
+    assert collector.problems == ()
+
+
+@pytest.mark.parametrize('messages', [[], [initial(1)], [initial(1), action(2), goal(5)]])
+def test_what_did_not_begin_or_is_complete_is_no_loose_end(messages):
+    assert collect(*messages).loose_end == ()
 
 
 def test_same_trial_object_as_long_as_nothing_changes():

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ('benchmark', 'config', 'dlo_calibration', 'doc', 'launch', 'msg_samples', 'test')
+FOLDERS = ('benchmark', 'config', 'dlo_calibration', 'doc', 'examples', 'launch', 'msg_samples', 'test')
 FILES = sorted([*ROOT.glob('*.py'), *(file for name in FOLDERS for file in (ROOT / name).rglob('*.py'))])
 
 HEADER = """\

@@ -55,8 +55,9 @@ def test_every_topic_is_documented():
         assert f'~/{name}' in text
 
 
-@pytest.mark.parametrize('document', ['README.md', 'CONTRIBUTING.md', 'doc/guide.md', 'doc/messages.md',
-                                      'doc/physics.md', 'msg_samples/README.md', 'benchmark/README.md'])
+@pytest.mark.parametrize('document', [
+    'README.md', 'CONTRIBUTING.md', 'doc/guide.md', 'doc/messages.md', 'doc/formats.md',
+    'doc/physics.md', 'msg_samples/README.md', 'benchmark/README.md'])
 def test_links_lead_somewhere(document):
     text = (ROOT / document).read_text(encoding='utf-8')
     for target in re.findall(r'\]\(([^)#]+)\)', text):
@@ -72,10 +73,10 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     from dlo_calibration.calibration import calibrate
     from dlo_calibration.chain import Chain
     from dlo_calibration.config import Options
+    from dlo_calibration.description import read_result, write_result
     from dlo_calibration.parameters import ParameterSpace
     from dlo_calibration.search import RandomSearch
     from dlo_calibration.session import read_session, session_trials
-    from dlo_calibration.xml import read_result, write_result
 
     session = read_session(ROOT / 'msg_samples/object1')
     trials, _ = session_trials(session, Options.of(session.options))

@@ -32,10 +32,10 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import cli, InputError
 from dlo_calibration.config import declarations, Options
-from dlo_calibration.diagnostics import result_values
+from dlo_calibration.description import read_description, read_result
+from dlo_calibration.diagnostics import OUTPUT_TYPES, result_values
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
 from dlo_calibration.session import read_session
-from dlo_calibration.xml import read_result
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
@@ -191,7 +191,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     written = read_result(folder / 'result.xml')
     assert written.values == {name: one['value'] for name, one in replayed['parameters'].items()}
     kinds = {record.name for record in read_session(folder).records}
-    assert kinds == {*INPUT_TYPES, 'progress', 'status', 'result'}
+    assert kinds == {*INPUT_TYPES, *OUTPUT_TYPES}
 
 
 def test_what_comes_after_the_start_is_for_the_next_one(start_node, tmp_path, capsys):
@@ -212,6 +212,25 @@ def test_what_comes_after_the_start_is_for_the_next_one(start_node, tmp_path, ca
     assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_2.xml'}
 
 
+def test_markers_show_trials_at_once_and_then_what_was_simulated(start_node):
+    robot, shown = start_node(), []
+    robot.node.create_subscription(TYPES.find(OUTPUT_TYPES['markers']), '/calibrator/markers',
+                                   lambda message: shown.append({one.ns for one in message.markers}), LATCHED)
+    robot.send(session_messages(TYPES, 2))
+    both = {f'trial_{k}/{name}' for k in (1, 2) for name in ('initial', 'goal', 'hands')}
+    robot.until(lambda: shown and both <= shown[-1], 'the trials are not shown')
+    assert not any(space.endswith('/simulated') for space in shown[-1])
+    robot.call('start')
+    robot.until_result()
+    robot.until(lambda: {'trial_1/simulated', 'trial_2/simulated'} <= shown[-1], 'the result is not shown')
+    robot.send(session_messages(TYPES, 1, first=2))
+    robot.until(lambda: 'trial_3/goal' in shown[-1], 'the third trial is not shown')
+    assert 'trial_1/simulated' in shown[-1]
+    assert 'trial_3/simulated' not in shown[-1]
+    robot.call('reset')
+    robot.until(lambda: not any(shown[-1]), 'the trials are still shown')
+
+
 def test_late_listener_gets_result_and_status(start_node):
     robot = start_node()
     robot.send(session_messages(TYPES, 1))
@@ -223,6 +242,22 @@ def test_late_listener_gets_result_and_status(start_node):
         robot.listen(name, LATCHED)
         robot.until(lambda name=name, before=before: len(robot.heard[name]) > before)
     assert values(robot.heard['status'][-1].status[0])['state'] == 'done'
+
+
+def test_description_of_the_dlo_is_the_text_of_the_result_file(start_node, tmp_path):
+    robot, heard = start_node(mass=0.03), []
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    robot.call('start')
+    live = result_values(robot.until_result())
+    robot.node.create_subscription(TYPES.find(OUTPUT_TYPES['dlo_description']), '/calibrator/dlo_description',
+                                   heard.append, LATCHED)  # late: it is latched
+    robot.until(lambda: heard, 'no description')
+    found = read_description(heard[0].data)
+    assert {name: one.physical_value for name, one in found.parameters.items()} == {
+        name: one['physical_value'] for name, one in live.items()}
+    folder, = folders(tmp_path)
+    assert heard[0].data == (folder / 'result.xml').read_text(encoding='utf-8')
 
 
 def test_start_without_a_complete_trial_is_refused_and_says_what_is_missing(start_node):

@@ -13,224 +13,189 @@
 # limitations under the License.
 
 
-"""Result files: exact there and back, and nothing read that should not be."""
 
-from dataclasses import asdict, replace
-import re
+"""Reading XML: what is no document of ours is refused in one line, before anything is made of it."""
+
+from contextlib import closing
+import socket
+import threading
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import etree
 import numpy as np
 import pytest
-from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration.calibration import calibrate, Evaluator
-from dlo_calibration.config import Options
+from dlo_calibration.chain import Chain
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.search.random import RandomSearch
-from dlo_calibration.xml import read_result, result_document, ResultFile, write_result
+from dlo_calibration.named_actions import LiftAndHold
+from dlo_calibration.request import GoalRequest, Request, request_of, TrialRequest
+from dlo_calibration.xml import MAXIMUM_ELEMENTS, MAXIMUM_SIZE, parse, text_of
 
-OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
-TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collision': 20.0}
-
-
-def calibrated(seed=1, mass=0.1 + 0.2):
-    space = ParameterSpace(('friction', 'flexibility'), {'elasticity': 100 / 3, 'damping': 1 / 3}, mass)
-    trials = [toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=0.3)]
-    return calibrate(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
+STRAIGHT = Chain(np.column_stack([np.linspace(0, 0.6, 4), np.zeros(4), np.zeros(4)]))
+REQUEST = Request((TrialRequest('one', STRAIGHT, (LiftAndHold(point=1),), (GoalRequest(STRAIGHT, 2.0),)),),
+                  {'mass': 0.03}, 'rope')
+TEXT = REQUEST.document.decode()
+HEAD, BODY = TEXT.split('\n', 1)
+NAMED = 'calibration_request'
 
 
-@pytest.fixture(scope='module')
-def result():
-    return calibrated()
-
-
-@pytest.fixture
-def file(tmp_path, result):
-    """Give the path of a result file that can be read."""
-    write_result(tmp_path / 'result.xml', result, OPTIONS.flat())
-    return tmp_path / 'result.xml'
-
-
-@pytest.mark.parametrize('seed', range(5))
-@pytest.mark.parametrize('mass', [0.0, 0.1 + 0.2])
-def test_same_physical_values_bit_for_bit(tmp_path, seed, mass):
-    result = calibrated(seed, mass)
-    write_result(tmp_path / 'result.xml', result)
-    found = read_result(tmp_path / 'result.xml')
-    assert found.values == result.values
-    assert found.physical() == result.physical()
-    assert found.space == result.space
-
-
-def test_value_of_a_found_parameter_in_the_options_does_not_count(tmp_path):
-    space = Options.of({'calibrate': ['friction'], 'friction': 12.0, 'damping': 80.0}).space
-    result = calibrate([toy_trial(TRUTH)], space, ToySimulator(), RandomSearch(1, 1), budget=3)
-    write_result(tmp_path / 'result.xml', result)
-    found = read_result(tmp_path / 'result.xml')
-    assert found.physical() == result.physical()
-    assert 'friction' not in found.fixed and found.fixed['damping'] == 80.0
-
-
-def test_same_simulation_bit_for_bit(file, result):
-    found = read_result(file)
-    rollouts = Evaluator(result.trials, found.space, ToySimulator()).simulate(found.values)
-    for rollout, goals, trial in zip(rollouts, result.chains, result.trials, strict=True):
-        np.testing.assert_allclose(rollout.chains, goals, atol=1e-12)
-        first, = Evaluator([trial], result.space, ToySimulator()).simulate(result.values)
-        np.testing.assert_array_equal(rollout.chains, first.chains)
-
-
-def test_everything_else_comes_back(file, result):
-    found = read_result(file)
-    assert {name: asdict(p) for name, p in found.parameters.items()} == {
-        name: asdict(p) for name, p in result.parameters.items()}
-    assert list(found.parameters) == ['friction', 'flexibility']
-    assert (found.score, found.scores, found.errors) == (result.best.score, result.best.scores, result.errors)
-    assert (found.search, found.engine, found.seed) == ('random', 'toy', 1)
-    assert (found.evaluations, found.simulations, found.stop_reason, found.seconds) == (
-        20, 40, result.stop_reason, result.seconds)
-    assert (found.trials, found.warnings) == (('trial 1', 'trial 2'), result.warnings)
-    np.testing.assert_array_equal(found.points, result.trials[0].initial.points)
-    assert Options.of(found.options) == OPTIONS
-
-
-def test_writing_what_was_read_gives_the_same_bytes(file):
-    assert result_document(read_result(file)) == file.read_bytes()
-
-
-def test_document_is_for_people_too(file):
-    lines = file.read_text(encoding='utf-8').splitlines()
-    assert lines[0] == "<?xml version='1.0' encoding='UTF-8'?>"
-    assert any(re.fullmatch(r' +<parameter name="flexibility" value="[0-9.]+".*/>', line) for line in lines)
-
-
-@settings(max_examples=200, deadline=None)
-@given(text=st.text(max_size=30), value=st.floats(0, 100), length=st.floats(1e-6, 1e6))
-def test_any_text_and_number_survives(tmp_path_factory, result, text, value, length):
-    path = tmp_path_factory.mktemp('any') / 'result.xml'
-    flexibility = replace(result.parameters['flexibility'], value=value, physical_unit=text)
-    given_file = replace(ResultFile.of(result), parameters={'flexibility': flexibility}, length=length,
-                         stop_reason=text, warnings=(text,))
-    write_result(path, given_file)
-    found = read_result(path)
-    assert (found.values, found.length) == ({'flexibility': value}, length)
-    printable = ''.join(c if c in '\t\n\r' or ' ' <= c < '\ufffe' or c > '\uffff' else '\ufffd' for c in text)
-    printable = re.sub('[\ud800-\udfff]', '\ufffd', printable)
-    assert found.stop_reason == found.parameters['flexibility'].physical_unit == printable
-    assert found.warnings == (printable,)
-
-
-def refused(path, match):
+def refused(octets, match=None):
+    """Return the refusal of a document, which takes one line and names the document."""
     with pytest.raises(InputError, match=match) as caught:
-        read_result(path)
-    assert '\n' not in str(caught.value)
+        parse(octets.encode() if isinstance(octets, str) else octets, 'file evil.xml', NAMED)
+    told = str(caught.value)
+    assert told.startswith('file evil.xml')
+    assert '\n' not in told and len(told) < 1000
+    return told
 
 
-@pytest.mark.parametrize('change, match', [
-    (('version="1"', 'version="2"'), 'calibration_result.*version'),
-    (('<calibration_result version="1">', '<calibration_result version="1" more="1">'), "'more'"),
-    (('<search ', '<hunt '), '<hunt>'),
-    (('<dlo ', '<dlo colour="red" '), '<dlo>.*colour'),
-    (('<fixed name="damping"', '<fixed name="friction"'), '<fixed>.*friction'),
-    (('<fixed name="damping"', '<fixed name="weight"'), 'weight'),
-    (('<fixed name="damping"', '<fixed name="elasticity"'), '<fixed>.*elasticity.*twice'),
-    (('<parameter name="friction" value="', '<parameter name="friction" value="1e9'), '<parameter>.*value'),
-    (('<parameter name="friction" value="', '<parameter name="friction" value="x'), '<parameter>.*value'),
-    (('<parameter name="friction"', '<parameter'), '<parameter>.*name'),
-    (('score="', 'score="nan'), 'score'),
-    (('<point x="0.0"', '<point x="inf"'), '<point>.*x'),
-    (('seed="1"', 'seed="1.5"'), '<search>.*seed'),
-    (('mass="', 'mass="-'), 'mass'),
-    (('identifiable="', 'identifiable="per'), 'identifiable'),
-    (('<options>', '<options>text'), '<options>.*text'),
-    (('<warnings/>', '<warnings/><warnings/>'), '<warnings>'),
-    (('<warnings/>', ''), '<warnings>'),
-    (('<warnings/>', '<warnings/><?do something?>'), 'calibration_result'),
-    (('name="seed" value="1"', 'name="seed" value="{"'), '<option>'),
-])
-def test_unexpected_is_refused_by_the_name_of_its_element(file, change, match):
-    text = file.read_text(encoding='utf-8')
-    changed = text.replace(*change, 1)
-    assert changed != text
-    file.write_text(changed, encoding='utf-8')
-    refused(file, match)
+def changed(old, new):
+    assert old in TEXT
+    return TEXT.replace(old, new, 1)
 
 
-@pytest.mark.parametrize('attribute', ['value', 'length', 'search', 'x'])
-def test_missing_attribute_is_named(file, attribute):
-    tree = etree.parse(str(file))
-    name = 'name' if attribute == 'search' else attribute
-    element = tree.find('search') if attribute == 'search' else tree.find(f'.//*[@{name}]')
-    del element.attrib[name]
-    tree.write(str(file))
-    refused(file, f'<{element.tag}>.*{name}')
+def test_the_document_itself_is_read():
+    assert parse(TEXT.encode(), 'x', NAMED).get('version') == '1'
+    assert parse(b'\xef\xbb\xbf' + TEXT.encode(), 'x', NAMED).tag == NAMED  # with a mark of the byte order
+    assert parse(BODY.encode(), 'x', NAMED).tag == NAMED
+    commented = changed('<settings/>', '<!-- said by\nnobody --><settings/>')
+    assert request_of(commented.encode()).document == TEXT.encode()
 
 
-def with_doctype(file, doctype, insert='', attribute=''):
-    text = file.read_text(encoding='utf-8').split('\n', 1)[1]
-    if attribute:
-        text = text.replace('engine="toy"', f'engine="{attribute}"')
-    file.write_text(f'{doctype}\n{text.replace("<warnings/>", f"<warnings/>{insert}")}', encoding='utf-8')
-
-
-def test_external_entity_is_refused_and_not_read(file, tmp_path):
+def test_external_entity_is_refused_and_not_read(tmp_path):
     secret = tmp_path / 'secret.txt'
     secret.write_text('the secret')
-    with_doctype(file, f'<!DOCTYPE calibration_result [<!ENTITY s SYSTEM "{secret.as_uri()}">]>', '&s;')
-    with pytest.raises(InputError) as caught:
-        read_result(file)
-    assert 'the secret' not in str(caught.value)
+    evil = f'<!DOCTYPE {NAMED} [<!ENTITY s SYSTEM "{secret.as_uri()}">]>\n{BODY}'
+    told = refused(evil.replace('<settings/>', '<settings>&s;</settings>'), 'line 1: .*DOCTYPE')
+    assert 'the secret' not in told
 
 
-def test_entity_in_an_attribute_is_refused(file):
-    with_doctype(file, '<!DOCTYPE calibration_result [<!ENTITY e "toy">]>', attribute='&e;')
-    refused(file, 'document type')
-
-
-def test_external_dtd_is_refused(file, tmp_path):
-    (tmp_path / 'some.dtd').write_text('<!ATTLIST dlo colour CDATA "red">')
-    with_doctype(file, '<!DOCTYPE calibration_result SYSTEM "some.dtd">')
-    refused(file, 'document type')
+@pytest.mark.parametrize('doctype', [
+    f'<!DOCTYPE {NAMED} [<!ENTITY e "rope">]>', f'<!DOCTYPE {NAMED} SYSTEM "some.dtd">',
+    f'<!DOCTYPE {NAMED} PUBLIC "-//X//Y" "http://127.0.0.1:9/some.dtd">',
+    f'<!DOCTYPE {NAMED} [<!ATTLIST trial name CDATA "x">]>', '<!DOCTYPE\n x>'])
+def test_document_type_is_refused_by_its_line(doctype):
+    refused(f'{HEAD}\n\n{doctype}\n{BODY.replace(">", " >")}', 'line 3: got a document type declaration')
+    refused(f'{HEAD}\n\n{doctype}\n{BODY}'.replace('"rope"', '"&e;"'), 'line 3: got a document type')
 
 
 @pytest.mark.parametrize('attribute', [False, True])
-def test_billion_laughs_are_refused(file, attribute):
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-16', 'utf-32'])
+def test_billion_laughs_are_refused(attribute, encoding):
     laughs = ''.join(f'<!ENTITY l{k + 1} "{f"&l{k};" * 10}">' for k in range(12))
-    with_doctype(file, f'<!DOCTYPE calibration_result [<!ENTITY l0 "ha">{laughs}]>',
-                 '' if attribute else '&l12;', '&l12;' if attribute else '')
-    refused(file, 'result file')
+    body = BODY.replace('name="one"', 'name="&l12;"') if attribute else BODY.replace(
+        '<settings/>', '<settings>&l12;</settings>')
+    evil = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE x [<!ENTITY l0 "ha">{laughs}]>{body}'
+    refused(evil.encode(encoding))
 
 
-@pytest.mark.parametrize('octets', [
-    b'', b'<', b'no xml', b'\xff\xfe\0', b'<robot/>', b'<calibration_result version="1"/>', b'<a>' * 5000])
-def test_what_is_no_result_is_refused(tmp_path, octets):
-    path = tmp_path / 'result.xml'
-    path.write_bytes(octets)
-    refused(path, 'result file')
+def test_entity_that_nobody_declared_is_refused():
+    refused(changed('name="rope"', 'name="&rope;"'), 'line 3')
 
 
-def test_path_without_file_is_refused(tmp_path):
-    refused(tmp_path / 'missing.xml', 'missing.xml')
-    refused(tmp_path, 'result file')
+@pytest.mark.parametrize('encoding', ['utf-16', 'utf-32', 'utf-7', 'cp037', 'latin-1'])
+def test_other_encodings_are_refused_or_read_as_utf_8(encoding):
+    text = changed("encoding='UTF-8'", f"encoding='{encoding}'").replace('name="one"', 'name="é+ADw-"')
+    refused(text.encode(encoding, 'replace').replace(b'?>', b' ?>', 1).replace(b'<settings/>', b'<settings>'))
 
 
-def test_place_that_cannot_be_written_is_refused(tmp_path, result):
-    with pytest.raises(InputError, match='result.xml'):
-        write_result(tmp_path / 'missing' / 'result.xml', result)
+def test_bytes_that_are_no_text_are_refused_by_their_line():
+    refused(TEXT.encode().replace(b'rope', b'r\xffpe'), 'line 3: got bytes that are not UTF-8')
 
 
-@settings(max_examples=200, deadline=None)
+@pytest.mark.parametrize('insert', [
+    '<x:include xmlns:x="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>',
+    '<settings xmlns="http://www.w3.org/2001/XMLSchema"/>'])
+def test_namespace_is_refused(insert):
+    refused(changed('<settings/>', insert), 'line 4, element.* in a namespace')
+
+
+@pytest.mark.parametrize('attribute', ['noNamespaceSchemaLocation', 'schemaLocation'])
+def test_schema_of_somebody_else_is_not_fetched(attribute):
+    with closing(socket.create_server(('127.0.0.1', 0))) as server:
+        met = []
+        server.settimeout(0.2)
+
+        def listen():
+            try:
+                met.append(server.accept())
+            except TimeoutError:
+                pass
+
+        listener = threading.Thread(target=listen)
+        listener.start()
+        place = f'http://127.0.0.1:{server.getsockname()[1]}/evil.xsd'
+        refused(changed(f'<{NAMED} ', f'<{NAMED} xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
+                        f'xsi:{attribute}="{place} {place}" '), 'line 2, .*namespace')
+        listener.join()
+    assert met == []
+
+
+@pytest.mark.parametrize('place', ['<settings/>', f'<{NAMED} ', f'</{NAMED}>'])
+def test_processing_instruction_is_refused(place):
+    refused(changed(place, f'<?do something?>{place}'), 'line .*processing instruction <.do.>')
+    refused(f'{TEXT}<?do something?>', 'processing instruction')
+
+
+@pytest.mark.parametrize('depth', [17, 1000, 100_000])
+def test_depth_is_refused_before_it_is_built(depth):
+    refused(f'<{NAMED}>\n' + '<a>' * depth + '</a>' * depth + f'</{NAMED}>', 'line 2')
+    refused('<a>' * depth)
+
+
+def test_too_many_elements_are_refused():
+    refused('<a>\n' + '<b/>' * (MAXIMUM_ELEMENTS + 1) + '</a>', f'line 2.* more than {MAXIMUM_ELEMENTS}')
+
+
+def test_too_many_bytes_are_refused():
+    refused(b'<a>' + b' ' * MAXIMUM_SIZE, f'more than {MAXIMUM_SIZE} bytes')
+
+
+@pytest.mark.parametrize('insert', ['9' * 100_000, 'x' * 11_000_000, '1' * 65])
+def test_long_number_is_refused(insert):
+    refused(changed('z="0.0"', f'z="{insert}"'), 'line')
+
+
+def test_many_attributes_are_refused():
+    attributes = ' '.join(f'a{k}="0"' for k in range(2000))
+    refused(changed('<settings/>', f'<settings {attributes}/>'), 'line 4')
+
+
+@pytest.mark.parametrize('octets', [b'', b'<', b'no xml', b'\xff\xfe\0', b'<robot/>', f'<{NAMED}/>'.encode(),
+                                    b'\0' * 100, b'<a></b>', b'<a/><a/>', b'<a b="1" b="2"/>', b'<a>'])
+def test_what_is_no_document_is_refused(octets):
+    refused(octets)
+
+
+@settings(max_examples=300, deadline=None)
+@given(octets=st.one_of(
+    st.binary(max_size=200), st.text(alphabet='<>/!?[]&;#x0"\' =aA', max_size=80).map(str.encode)))
+def test_any_bytes_are_refused(octets):
+    refused(octets)
+
+
+@settings(max_examples=300, deadline=None)
 @given(place=st.floats(0, 1), octets=st.binary(max_size=6))
-def test_damaged_anywhere_is_read_or_refused(tmp_path_factory, result, place, octets):
-    document = bytearray(result_document(result, OPTIONS.flat()))
+def test_damaged_anywhere_is_read_or_refused(place, octets):
+    document = bytearray(TEXT.encode())
     at = int(place * len(document))
     document[at:at + len(octets)] = octets
-    path = tmp_path_factory.mktemp('damaged') / 'result.xml'
-    path.write_bytes(document)
     try:
-        read_result(path)
+        request_of(bytes(document), 'file evil.xml')
     except InputError as error:
-        assert str(path) in str(error)
+        assert str(error).startswith('file evil.xml')
+        assert '\n' not in str(error)
+
+
+@given(value=st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.integers(-2**53, 2**53)))
+def test_any_number_is_what_the_schema_calls_a_number(value):
+    document = changed('z="0.0"', f'z="{text_of(value)}"')
+    point = parse(document.encode(), 'x', NAMED).find('.//point')
+    assert float(point.get('z')) == value
+
+
+def test_written_form_does_not_depend_on_how_it_was_indented():
+    root = etree.fromstring(TEXT.encode())
+    flat = etree.tostring(root).replace(b'\n', b'').replace(b'  ', b'')
+    assert request_of(flat).document == TEXT.encode()

@@ -1,0 +1,110 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Foxglove's own readers (from npm) read our sessions as we do; needs node, npm and the network."""
+
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_typestore, Stores
+
+from dlo_calibration.diagnostics import OUTPUT_TYPES, status
+from dlo_calibration.messages import bag_types
+from dlo_calibration.session import encode, read_session, SessionWriter
+
+SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
+HERE = Path(__file__).parent / 'foxglove'
+STORE = get_typestore(Stores.ROS2_JAZZY)
+PATIENCE = 300  # s
+
+
+@pytest.fixture(scope='module')
+def foxglove(tmp_path_factory):
+    """Give a function that reads a file with Foxglove's libraries, which are installed elsewhere."""
+    for program in ('node', 'npm'):
+        if shutil.which(program) is None:
+            pytest.skip(f'{program} is not installed')
+    folder = tmp_path_factory.mktemp('foxglove')
+    for file in ('package.json', 'package-lock.json', 'read.mjs'):
+        shutil.copy(HERE / file, folder)
+    installed = subprocess.run(['npm', 'ci', '--ignore-scripts', '--no-audit', '--no-fund'], cwd=folder,
+                               capture_output=True, text=True, timeout=PATIENCE)
+    if installed.returncode:
+        pytest.skip(f'npm cannot install the readers: {installed.stderr.strip().splitlines()[-1:]}')
+
+    def read(how, path):
+        done = subprocess.run(['node', 'read.mjs', how, str(path)], cwd=folder, capture_output=True,
+                              text=True, timeout=PATIENCE)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return read
+
+
+def plain(message):
+    """Return what a message of the library rosbags holds, as JSON has it."""
+    if hasattr(message, '__msgtype__'):
+        return {name: plain(value) for name, value in vars(message).items()
+                if not name.startswith('__') and not name.isupper()}  # those are constants of the type
+    if hasattr(message, 'tolist'):
+        return message.tolist()
+    return [plain(one) for one in message] if isinstance(message, (list, tuple)) else message
+
+
+def expected(folder):
+    """Return the messages of a session as rosbags reads them."""
+    with Reader(folder) as reader:
+        return [{'topic': connection.topic, 'type': connection.msgtype,
+                 'message': plain(STORE.deserialize_cdr(data, connection.msgtype))}
+                for connection, _, data in reader.messages()]
+
+
+@pytest.mark.parametrize('sample', sorted(path.name for path in SAMPLES.glob('object?')))
+def test_foxglove_reads_what_rosbags_reads(foxglove, sample):
+    file, = (SAMPLES / sample).glob('*.mcap')
+    found = foxglove('indexed', file)
+    assert found['profile'] == 'ros2'
+    assert found['messages'] == expected(SAMPLES / sample)
+
+
+def test_foxglove_reads_what_the_node_tells(foxglove, tmp_path):
+    kind = OUTPUT_TYPES['status']
+    said = status(bag_types(), stamp=5, state='failed', trials=3, last_refusal='\u00fc', detail='why')
+    with SessionWriter(tmp_path / 'session', {'seed': 3}) as writer:
+        for k in range(3):
+            writer.write('/calibrator/status', kind, encode(said, kind), k + 1)
+        writer.write_mark('start')
+    messages = foxglove('indexed', writer.file)['messages']
+    assert len(messages) == 3
+    assert messages == expected(writer.path)
+    assert foxglove('streamed', writer.file)['messages'] == messages
+
+
+def test_foxglove_reads_a_killed_session_up_to_its_last_message(foxglove, tmp_path):
+    writer = SessionWriter(tmp_path / 'session')
+    for record in read_session(SAMPLES / 'object1').records:
+        writer.write(record.topic, record.type, record.data, record.log_time)
+    killed = tmp_path / 'killed.mcap'
+    shutil.copy(writer.file, killed)  # as it is on the disk while it is recorded: without index
+    os.truncate(killed, killed.stat().st_size - 150)  # in the last chunk, which an index of it follows
+    writer.close()
+    messages = foxglove('streamed', killed)['messages']
+    assert messages == expected(SAMPLES / 'object1')[:-1]

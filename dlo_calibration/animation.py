@@ -1,0 +1,172 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Animations: the simulated motion of a trial, as a GIF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Mapping
+
+import numpy as np
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.picture import (
+    add_legend,
+    as_text,
+    blank_figure,
+    hand_colours,
+    OBSERVED,
+    SIMULATED,
+    unwritable,
+    View,
+)
+from dlo_calibration.simulator import Simulator
+from dlo_calibration.trial import Goal, Trial
+
+FRAME_RATE = 10  # 1/s; GIF counts time in 0.01 s
+MOST_FRAMES = 120  # of the motion; a longer one is shown faster
+AFTERWARDS = 1.0  # s that are shown after the last hand has arrived
+PAUSE = 1.6  # s that the end is shown
+DOTS_PER_INCH = 80
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    A simulated trial over time.
+
+    :param times: (k,) [s] of the trial, increasing.
+    :param chains: (k, n, 3) [m] simulated then.
+    :param ends: (g, n, 3) [m] simulated at the goals of the trial.
+    """
+
+    times: Floats
+    chains: Floats
+    ends: Floats
+
+
+def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
+    """Return a trial with timed goals, named by nothing but their time, between those that it has."""
+    last = max(max(hand.end for hand in trial.hands) + AFTERWARDS, trial.goals[-1].time)
+    taken = {goal.time for goal in trial.goals}
+    count = min(frames, max(2, round(last * FRAME_RATE) + 1))
+    added = []
+    for time in np.linspace(0.0, last, count):
+        if float(time) not in taken:
+            # A hand holds in between what it holds in the next goal, as in the trial itself.
+            following = next((goal for goal in trial.goals if goal.time > time), trial.goals[-1])
+            added.append(Goal(trial.initial, float(time), stable=False, held_by=following.held_by))
+    return replace(trial, goals=(*trial.goals, *added))
+
+
+def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, float]) -> Motion:
+    """
+    Simulate a trial, and keep how the DLO moved.
+
+    :param physical: parameters by name (SI units).
+    :raises SimulationError: where the rollout diverges.
+    """
+    dense = densely(trial)
+    chains = simulator.simulate(dense, physical).chains
+    asked = {id(goal.chain) for goal in trial.goals}
+    ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in asked]
+    # A stable goal shows the DLO at rest, which is later than its stamp says.
+    shown = [k for k, goal in enumerate(dense.goals) if not goal.stable]
+    return Motion(np.array([dense.goals[k].time for k in shown]), chains[shown], chains[ends])
+
+
+def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
+    """
+    Write a GIF: from above on the left, from the side on the right, the goal as it was measured.
+
+    :raises InputError: where the file cannot be written.
+    """
+    from matplotlib.animation import PillowWriter
+
+    speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
+    scene = _Scene(trial, motion, speed)
+    writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': f'{trial.name}, simulated'})
+    try:
+        with writer.saving(scene.figure, str(path), DOTS_PER_INCH):
+            for time, chain in zip(motion.times, motion.chains, strict=True):
+                scene.show(float(time), chain, f't = {time:.2f} s')
+                writer.grab_frame()
+            scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
+            for _ in range(round(PAUSE * FRAME_RATE)):
+                writer.grab_frame()
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+class _Scene:
+    """A figure in which only the simulated chain and the hands move."""
+
+    def __init__(self, trial: Trial, motion: Motion, speed: float) -> None:
+        self.figure = blank_figure(10.5, 4.8)
+        self._trial = trial
+        self._speed = '' if speed < 1.05 else f', {speed:.1f} times as fast as in reality'
+        self._colours = hand_colours([trial])
+        self._moving: list[tuple[View, Any, Any, Mapping[str, Any]]] = []
+        self._tracked = any(not goal.stable for goal in trial.goals)
+        self._title = self.figure.suptitle(' ', fontweight='bold')
+        axes = self.figure.subplots(1, 2)
+        for one, above in zip(axes, (True, False), strict=True):
+            self._moving.append(self._prepare(View(one, trial, self._colours, above=above), motion))
+        add_legend(self.figure, list(axes), columns=3)
+        self.figure.draw_without_rendering()
+        self.figure.set_layout_engine('none')  # else the axes would tremble
+
+    def _prepare(self, view: View, motion: Motion) -> tuple[View, Any, Any, Mapping[str, Any]]:
+        view.draw_start()
+        measured, = view.axes.plot(
+            *view.flat(self._trial.goals[-1].chain.points), 'o', color=OBSERVED, markersize=4,
+            alpha=0.5, linestyle='none', zorder=2,
+            label='measured, the last until then' if self._tracked else 'after the action, measured')
+        line, = view.axes.plot(*view.flat(motion.chains[0]), 'o-', color=SIMULATED, linewidth=2.5,
+                               markersize=3, label='simulated', zorder=3)
+        hands = {}
+        for hand in self._trial.hands:
+            if hand.name not in hands:
+                hands[hand.name], = view.axes.plot(
+                    *view.flat(hand.positions[:1]), 's', color=self._colours[hand.name], markersize=9,
+                    linestyle='none', label=as_text(f'{hand.name} (hollow: open)'), zorder=4)
+        everything = np.concatenate([*motion.chains, *motion.ends,
+                                     *(hand.positions for hand in self._trial.hands)])
+        view.axes.update_datalim(view.flat(everything).T)
+        view.axes.autoscale_view()
+        return view, measured, line, hands
+
+    def show(self, time: float, chain: Floats, when: str) -> None:
+        """Show an instant of the trial [s]."""
+        self._title.set_text(as_text(f'{self._trial.name}, simulated: {when}{self._speed}'))
+        holding = {hand.name for hand in self._trial.holding(self._goal_at(time))}
+        begun = [hand for hand in self._trial.hands if hand.start <= time]
+        current = {**{hand.name: hand for hand in reversed(self._trial.hands)},
+                   **{hand.name: hand for hand in begun}}  # the latest of a name, else its first
+        seen = [goal.chain for goal in self._trial.goals if goal.time <= time] or [self._trial.initial]
+        for view, measured, line, hands in self._moving:
+            line.set_data(*view.flat(chain))
+            if self._tracked:
+                measured.set_data(*view.flat(seen[-1].points))
+            for name, hand in current.items():
+                hands[name].set_data(*view.flat(hand.positions_at(time)))
+                hands[name].set_markerfacecolor(self._colours[name] if name in holding else 'none')
+
+    def _goal_at(self, time: float) -> Goal:
+        following = next((goal for goal in self._trial.goals if goal.time >= time), self._trial.goals[-1])
+        return Goal(self._trial.initial, time, stable=False, held_by=following.held_by)

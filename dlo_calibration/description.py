@@ -1,0 +1,249 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Description: the definition of a DLO as an XML document.
+
+Its point chain with annotations, its parameters with units and intervals, its
+mass, and how they were found.  The node publishes it, and result.xml holds it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields
+import math
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Mapping
+
+from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
+from dlo_calibration.chain import Chain
+from dlo_calibration.errors import InputError
+from dlo_calibration.parameters import PARAMETERS, ParameterSpace, SCALE
+from dlo_calibration.score import PointErrors
+from dlo_calibration.xml import (
+    add,
+    add_chain,
+    add_options,
+    document,
+    new_root,
+    number,
+    parse,
+    read_chain,
+    read_octets,
+    read_options,
+    refused,
+    text_of,
+    write_octets,
+)
+
+ROOT = 'dlo'
+WHAT = 'result file'
+TOLERANCE = 1e-3  # relative, of a physical value that somebody rounded
+
+ESTIMATE_NUMBERS = ('value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')
+ERROR_NUMBERS = tuple(one.name for one in fields(PointErrors))
+
+
+@dataclass(frozen=True)
+class Description:
+    """
+    What the definition of a DLO says.
+
+    :param parameters: the found ones, in the order of the calibration.
+    :param fixed: values of others on the 0..100 scale; those not named keep their default.
+    :param mass: kg of the whole DLO; 0 where it was not known.
+    :param length: mean length of the DLO over the trials [m].
+    :param chain: the DLO at rest, before the first trial's action, with its annotations.
+    :param options: those in force, by name; empty where they were not given.
+    :param trials: names of the trials.
+    :param scores: difference score of each trial.
+    """
+
+    parameters: Mapping[str, ParameterEstimate]
+    fixed: Mapping[str, float]
+    mass: float
+    length: float
+    chain: Chain
+    score: float
+    trials: tuple[str, ...]
+    scores: tuple[float, ...]
+    errors: PointErrors
+    search: str
+    engine: str
+    seed: int | None
+    evaluations: int
+    simulations: int
+    seconds: float
+    stop_reason: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ('parameters', 'fixed', 'options'):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @classmethod
+    def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> Description:
+        """Return the definition of the DLO that a calibration found."""
+        space = result.space
+        fixed = {p.name: space.fixed.get(p.name, p.default) for p in PARAMETERS
+                 if p.name not in result.parameters and (p.name != 'mass' or 'mass' in space.fixed)}
+        return cls(
+            parameters=result.parameters, mass=space.mass, fixed=fixed,
+            length=result.length, chain=result.trials[0].initial, score=result.best.score,
+            trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
+            errors=result.errors, search=result.search, engine=result.engine, seed=result.seed,
+            evaluations=len(result.evaluations), simulations=result.simulations, seconds=result.seconds,
+            stop_reason=result.stop_reason, options=options or {}, warnings=result.warnings)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Found parameters on the 0..100 scale, by name."""
+        return {name: estimate.value for name, estimate in self.parameters.items()}
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The parameters that were found, and where the others stayed."""
+        return ParameterSpace(tuple(self.parameters), self.fixed, self.mass)
+
+    def physical(self) -> dict[str, float]:
+        """Every parameter's physical value in SI units, exactly as they were in the best evaluation."""
+        return self.space.physical(self.values, self.length)
+
+
+def description_document(found: CalibrationResult | Description,
+                         options: Mapping[str, Any] | None = None) -> bytes:
+    """Return the definition of a DLO as an XML document in UTF-8."""
+    dlo = found if isinstance(found, Description) else Description.of(found, options)
+    space = dlo.space
+    root = new_root(ROOT)
+    root.set('mass', text_of(dlo.mass))
+    root.set('length', text_of(dlo.length))
+    add_chain(root, 'chain', dlo.chain)
+    parameters = add(root, 'parameters')
+    for estimate in dlo.parameters.values():
+        add(parameters, 'found', **asdict(estimate))
+    for name, value in dlo.fixed.items():
+        physical, unit = space.reported(name, value)
+        add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)
+    calibration = add(root, 'calibration', search=dlo.search, engine=dlo.engine,
+                      seed='none' if dlo.seed is None else dlo.seed, evaluations=dlo.evaluations,
+                      simulations=dlo.simulations, seconds=dlo.seconds, stop_reason=dlo.stop_reason)
+    fit = add(calibration, 'fit', score=dlo.score, **asdict(dlo.errors))
+    for name, score in zip(dlo.trials, dlo.scores, strict=True):
+        add(fit, 'trial', name=name, score=score)
+    add_options(calibration, 'options', dlo.options)
+    warnings = add(calibration, 'warnings')
+    for text in dlo.warnings:
+        add(warnings, 'warning', text=text)
+    return document(root)
+
+
+def write_result(path: str | Path, result: CalibrationResult | Description,
+                 options: Mapping[str, Any] | None = None) -> None:
+    """
+    Write a result, and the options in force, to an XML file.
+
+    :raises InputError: where the file cannot be written.
+    """
+    write_octets(path, description_document(result, options), WHAT)
+
+
+def read_result(path: str | Path) -> Description:
+    """
+    Read a result file.
+
+    :raises InputError: where it cannot be read, or is not such a document;
+        the text names the line and the element.
+    """
+    return read_description(read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}')
+
+
+def read_description(octets: bytes | str, where: str = 'dlo_description') -> Description:
+    """
+    Read a document, e.g. the text of the message `dlo_description`.
+
+    :param where: names it in refusals.
+    :raises InputError: where it is not such a document.
+    """
+    if isinstance(octets, str):
+        octets = octets.encode('utf-8', 'surrogatepass')
+    root = parse(octets, where, ROOT)
+    chain, parameters, calibration = root
+    fit, options, warnings = calibration
+    seed = calibration.get('seed')
+    try:
+        dlo = Description(
+            parameters=_estimates(where, parameters), fixed=_fixed(where, parameters),
+            mass=number(where, root, 'mass'), length=number(where, root, 'length'),
+            chain=read_chain(where, chain), score=number(where, fit, 'score'),
+            trials=tuple(trial.get('name') for trial in fit),
+            scores=tuple(number(where, trial, 'score') for trial in fit),
+            errors=PointErrors(**{name: number(where, fit, name) for name in ERROR_NUMBERS}),
+            search=calibration.get('search'), engine=calibration.get('engine'),
+            seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
+            simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
+            stop_reason=calibration.get('stop_reason'), options=read_options(where, options),
+            warnings=tuple(warning.get('text') for warning in warnings))
+        space = dlo.space
+    except InputError as error:
+        if error.thing.startswith(where):
+            raise
+        raise refused(where, parameters, f'{error.thing}: {error.came}', error.expected,
+                      error.remedy) from error
+    if not dlo.mass >= 0 or not dlo.length > 0:
+        raise refused(where, root, f'mass {dlo.mass:g} kg, length {dlo.length:g} m',
+                      'a mass of 0 or more, a length above 0', 'correct them')
+    for element in parameters.findall('fixed'):
+        _check_physical(where, element, space)
+    return dlo
+
+
+def _estimates(where: str, parameters: Any) -> dict[str, ParameterEstimate]:
+    found: dict[str, ParameterEstimate] = {}
+    for element in parameters.findall('found'):
+        name = element.get('name')
+        numbers = {one: number(where, element, one) for one in ESTIMATE_NUMBERS}
+        if name in found:
+            raise refused(where, element, f'the name {name!r} twice', 'each name once')
+        if not 0 <= numbers['value'] <= SCALE:
+            raise refused(where, element, f'value {numbers["value"]:g}', '0 to 100')
+        found[name] = ParameterEstimate(name=name, physical_unit=element.get('physical_unit'),
+                                        identifiable=element.get('identifiable') == 'true', **numbers)
+    return found
+
+
+def _fixed(where: str, parameters: Any) -> dict[str, float]:
+    names = {element.get('name') for element in parameters.findall('found')}
+    fixed: dict[str, float] = {}
+    for element in parameters.findall('fixed'):
+        name = element.get('name')
+        if name in names:
+            raise refused(where, element, f'the name {name!r} twice', 'each name once, found or fixed')
+        names.add(name)
+        fixed[name] = number(where, element, 'value')
+        if not 0 <= fixed[name] <= SCALE:
+            raise refused(where, element, f'value {fixed[name]:g}', '0 to 100')
+    return fixed
+
+
+def _check_physical(where: str, element: Any, space: ParameterSpace) -> None:
+    """Refuse a value that was changed in one of its units only."""
+    physical, unit = space.reported(element.get('name'), number(where, element, 'value'))
+    given = number(where, element, 'physical_value')
+    if not math.isclose(given, physical, rel_tol=TOLERANCE) or element.get('physical_unit') != unit:
+        raise refused(where, element, f'{given:g} {element.get("physical_unit")}, which is not what '
+                      f'{element.get("value")} is', f'{physical:g} {unit}', 'change both')

@@ -1,0 +1,191 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Markers: trials and what was simulated of them, to be seen in RViz and Foxglove."""
+
+from __future__ import annotations
+
+from typing import Any, Iterator, Sequence
+
+import numpy as np
+
+from dlo_calibration.action import Hand
+from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.chain import Floats
+from dlo_calibration.diagnostics import OUTPUT_TYPES
+from dlo_calibration.messages import MessageTypes
+from dlo_calibration.score import PointErrors, residuals
+from dlo_calibration.trial import shown_goals, Trial
+
+CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9  # visualization_msgs/Marker
+ADD, DELETE_ALL = 0, 3
+
+MOST_POINTS = 200  # of a chain or path; more are not to be told apart
+PATH_SAMPLES = 40
+THICKNESS = 0.01  # of a line, relative to the length of the DLO
+#: Error [share of the DLO's length] that is shown all red; half of it is yellow, none is green.
+RED_ERROR = 0.03
+
+Colour = tuple[float, float, float]
+INITIAL_COLOUR, GOAL_COLOUR, SIMULATED_COLOUR = (0.6, 0.6, 0.6), (0.25, 0.6, 1.0), (1.0, 0.55, 0.1)
+TEXT_COLOUR = (0.9, 0.9, 0.9)
+HAND_COLOURS = ((0.2, 0.8, 0.3), (0.75, 0.45, 0.9), (0.75, 0.55, 0.4), (0.95, 0.5, 0.75))
+
+
+def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_id: str,
+            result: CalibrationResult | None = None) -> Any:
+    """
+    Build the message that shows trials; it takes the place of any message before it.
+
+    Namespaces are ``trial_1/initial``, ``/goal``, ``/simulated``, ``/error``, ``/hands``, ``/label``.
+    The same thing has the same id in every message: ids follow from the index of a goal or a hand.
+
+    :param frame_id: of the session.
+    :param result: what is simulated of those `trials` that it was found with.
+    """
+    header = types.header(stamp, frame_id)
+    built = [_Brush(types, header, '', 1.0).marker('', 0, SPHERE, action=DELETE_ALL)]
+    simulated = {} if result is None else {
+        trial.name: (trial, chains) for trial, chains in zip(result.trials, result.chains, strict=True)}
+    for k, trial in enumerate(trials):
+        of_result, chains = simulated.get(trial.name, (trial, None))
+        brush = _Brush(types, header, f'trial_{k + 1}', THICKNESS * trial.initial.length)
+        built += _trial_markers(brush, trial, chains if _same(trial, of_result) else None, k)
+    return types.build(OUTPUT_TYPES['markers'], markers=built)
+
+
+def error_colour(share: float) -> Colour:
+    """Return red, green and blue of a point error, given as a share of the DLO's length."""
+    red = min(max(share / RED_ERROR, 0.0), 1.0)
+    return min(2 * red, 1.0), min(2 - 2 * red, 1.0), 0.1
+
+
+def _same(trial: Trial, other: Trial) -> bool:
+    """Tell whether two trials have the same goals."""
+    return trial is other or len(trial.goals) == len(other.goals) and all(
+        np.array_equal(one.chain.points, two.chain.points)
+        for one, two in zip(trial.goals, other.goals, strict=True))
+
+
+def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
+    yield brush.line('initial', 0, trial.initial.points, INITIAL_COLOUR)
+    for goal in shown_goals(len(trial.goals)):
+        measured = trial.goals[goal].chain.points
+        yield brush.spheres('goal', 2 * goal, measured, [GOAL_COLOUR], 1.2)
+        yield brush.line('goal', 2 * goal + 1, measured, GOAL_COLOUR, 0.5)
+        if chains is not None:
+            yield brush.line('simulated', goal, chains[goal], SIMULATED_COLOUR)
+            yield from _error_markers(brush, goal, measured, chains[goal], trial.initial.length)
+    for place, hand in enumerate(trial.hands):
+        yield from _hand_markers(brush, 3 * place, hand, HAND_COLOURS[place % len(HAND_COLOURS)], trial)
+    text = trial.name
+    if chains is not None:
+        errors = PointErrors.of(residuals(trial, chains))
+        text += f': mean error {errors.mean * 1e3:.1f} mm, max {errors.max * 1e3:.1f} mm'
+    # Trials happen in the same place; their labels are stacked.
+    above = [0.0, 0.0, brush.thickness * (6 + 5 * k)]
+    yield brush.label('label', 0, trial.initial.points[0] + above, text)
+
+
+def _error_markers(brush: _Brush, goal: int, measured: Floats, simulated: Floats,
+                   length: float) -> Iterator[Any]:
+    """Show the error of each point: a sphere where it was simulated, and a line to where it was."""
+    colours = [error_colour(float(error) / length)
+               for error in np.linalg.norm(simulated - measured, axis=1)]
+    yield brush.spheres('error', 2 * goal, simulated, colours, 1.7)
+    pairs = np.stack([measured, simulated], axis=1).reshape(-1, 3)
+    yield brush.marker('error', 2 * goal + 1, LINE_LIST, points=pairs, scale=0.4, group=2,
+                       colours=[colour for colour in colours for _ in range(2)])
+
+
+def _hand_markers(brush: _Brush, first: int, hand: Hand, colour: Colour, trial: Trial) -> Iterator[Any]:
+    """Show a hand's path, the points that it grips as it closes, and where it opens."""
+    path = hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, PATH_SAMPLES)))
+    if np.ptp(path, axis=0).max() > 0:
+        yield brush.line('hands', first, path, colour, 0.5)
+    yield brush.spheres('hands', first + 1, trial.initial.points[list(hand.grips)], [colour], 2.2)
+    yield brush.marker('hands', first + 2, CUBE, at=path[-1], colours=[colour], scale=2.0)
+
+
+class _Brush:
+    """
+    Draws the markers of one trial.
+
+    :param space: that all namespaces begin with.
+    :param thickness: of a line [m]; the scales given to its methods are multiples of that.
+    """
+
+    def __init__(self, types: MessageTypes, header: Any, space: str, thickness: float) -> None:
+        self.thickness = thickness
+        self._types = types
+        self._header = header
+        self._space = space
+
+    def line(self, name: str, number: int, points: Floats, colour: Colour, scale: float = 1.0) -> Any:
+        """Draw a line through (n, 3) points [m]."""
+        return self.marker(name, number, LINE_STRIP, points=points, colours=[colour], scale=scale)
+
+    def spheres(self, name: str, number: int, points: Floats, colours: Sequence[Colour],
+                scale: float) -> Any:
+        """Draw a sphere at each of (n, 3) points [m], of one colour or of a colour each."""
+        return self.marker(name, number, SPHERE_LIST, points=points, colours=colours, scale=scale)
+
+    def label(self, name: str, number: int, at: Floats, text: str) -> Any:
+        """Write text at a place, (3,) [m]."""
+        return self.marker(name, number, TEXT, at=at, colours=[TEXT_COLOUR], scale=4.0, text=text)
+
+    def marker(self, name: str, number: int, kind: int, *, points: Floats | None = None,
+               at: Floats | None = None, colours: Sequence[Colour] = (TEXT_COLOUR,), scale: float = 1.0,
+               text: str = '', group: int = 1, action: int = ADD) -> Any:
+        """
+        Build a marker.
+
+        :param points: (n, 3) [m] of a list or strip, as `group`s that stay together.
+        :param at: (3,) [m] where it is; None: at the origin.
+        :param colours: one of the whole, or one per point.
+        """
+        build = self._types.build
+        points = np.zeros((0, 3)) if points is None else points
+        kept = _kept(len(points), group)
+        x, y, z = (0.0, 0.0, 0.0) if at is None else (float(value) for value in at)
+        size = scale * self.thickness
+        # Only the first number counts for lines, only the last for text.
+        return build(
+            'visualization_msgs/msg/Marker', header=self._header, ns=f'{self._space}/{name}' if name else '',
+            id=number, type=kind, action=action,
+            pose=build('geometry_msgs/msg/Pose', position=build('geometry_msgs/msg/Point', x=x, y=y, z=z),
+                       orientation=build('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)),
+            scale=build('geometry_msgs/msg/Vector3', x=size, y=size, z=size),
+            color=self._colour(colours[0]),
+            lifetime=build('builtin_interfaces/msg/Duration', sec=0, nanosec=0), frame_locked=False,
+            points=[build('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in points[kept].tolist()],
+            colors=[self._colour(colours[k]) for k in kept] if len(colours) > 1 else [],
+            texture_resource='', texture=build(
+                'sensor_msgs/msg/CompressedImage', header=self._header, format='',
+                data=self._types.octets(b'')),
+            uv_coordinates=[], text=text, mesh_resource='', mesh_file=build(
+                'visualization_msgs/msg/MeshFile', filename='', data=self._types.octets(b'')),
+            mesh_use_embedded_materials=False)
+
+    def _colour(self, colour: Colour) -> Any:
+        red, green, blue = colour
+        return self._types.build('std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=1.0)
+
+
+def _kept(count: int, group: int) -> list[int]:
+    """Return the indices of at most MOST_POINTS groups, evenly spread over `count` points."""
+    groups = count // group
+    chosen = np.unique(np.linspace(0, groups - 1, min(groups, MOST_POINTS)).round().astype(int))
+    return [group * int(k) + i for k in chosen for i in range(group)]

@@ -1,0 +1,79 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""
+Parameter file: ``config/calibrator.yaml``, every parameter of the node with a comment.
+
+After a change of the declarations, make it again with
+
+    python -m dlo_calibration.parameter_file > config/calibrator.yaml
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import textwrap
+
+from dlo_calibration.config import Declaration, declarations
+
+HEAD = """\
+Parameters of the node calibrator, with their defaults.  To change some, copy this file, change their
+values there (lines that you leave out keep the default), and give the copy to the node:
+
+    ros2 run dlo_calibration calibrator --ros-args --params-file my_calibrator.yaml
+    ros2 launch dlo_calibration calibrator.launch.py params_file:=my_calibrator.yaml
+
+An unknown name or a value out of range is refused when the node starts.
+
+This file is made from the declarations: python -m dlo_calibration.parameter_file > config/calibrator.yaml
+"""
+WIDTH = 100  # columns
+INDENT = '    '
+
+
+def parameter_file() -> str:
+    """Return the text of the file."""
+    head = ''.join(f'# {line}'.rstrip() + '\n' for line in HEAD.splitlines())
+    return f'{head}\n/**:\n  ros__parameters:\n' + '\n'.join(_entry(d) for d in declarations())
+
+
+def _entry(declaration: Declaration) -> str:
+    """Return the lines of one option: what it is, its unit and range, its default."""
+    text = declaration.description[0].upper() + declaration.description[1:] + '.'
+    lines = textwrap.wrap(text, WIDTH - len(INDENT) - 2, break_on_hyphens=False)
+    if allowed := _allowed(declaration):
+        lines += textwrap.wrap(allowed, WIDTH - len(INDENT) - 2, subsequent_indent='  ')
+    value = list(declaration.default) if isinstance(declaration.default, tuple) else declaration.default
+    # JSON is YAML, with a type that nobody can mistake.
+    return ''.join(f'{INDENT}# {line}\n' for line in lines) + \
+        f'{INDENT}{declaration.name}: {json.dumps(value)}\n'
+
+
+def _allowed(declaration: Declaration) -> str:
+    """Say in words which values an option may have."""
+    if declaration.choices:
+        some = 'Any of' if isinstance(declaration.default, tuple) else 'One of'
+        return f'{some}: {", ".join(declaration.choices)}.'
+    if declaration.minimum is None or declaration.maximum is None:
+        return ''
+    low, high = ((f'{bound:g}' if isinstance(declaration.default, float) else f'{bound:.0f}')
+                 for bound in (declaration.minimum, declaration.maximum))
+    return f'From {low} to {high} {declaration.unit}'.rstrip() + '.'
+
+
+if __name__ == '__main__':
+    sys.stdout.write(parameter_file())

@@ -1,0 +1,336 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Request: what to calibrate as an XML document: the object, the settings, the trials.
+
+A trial's actions are named ones, or explicit paths of hands.  A named action is
+done on the latest observed chain before it: the initial one, or a goal chain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+import re
+from types import MappingProxyType
+from typing import Any, Mapping, Union
+
+import numpy as np
+
+from dlo_calibration.action import Action, Hand, NO_ROTATION
+from dlo_calibration.chain import Chain, Floats, frozen_array
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.named_actions import NAMED_ACTIONS, NamedAction
+from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.xml import (
+    add,
+    add_chain,
+    add_options,
+    document,
+    finite,
+    new_root,
+    number,
+    parse,
+    read_chain,
+    read_octets,
+    read_options,
+    read_vectors,
+    refused,
+    write_octets,
+)
+
+ROOT = 'calibration_request'
+WHAT = 'request'
+PATHS = 'hand_paths'
+TURNS = ('qx', 'qy', 'qz', 'qw')
+LAST = ('start', 'hold')  # attributes of a named action that come after the others
+HAND_NAME = re.compile(r'[^\s\x00-\x1f\ud800-\udfff\ufffe\uffff]{1,100}')
+
+
+@dataclass(frozen=True)
+class GoalRequest:
+    """
+    A goal chain of a request.
+
+    :param time: seconds since the start of the trial.
+    :param stable: compared when the simulated DLO has come to rest, else at that instant.
+    :param held_by: names of the hands that hold it; None: as the actions before it say.
+    """
+
+    chain: Chain
+    time: float
+    stable: bool = True
+    held_by: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class TrialRequest:
+    """
+    A trial of a request.
+
+    :param actions: named ones, or what hands did.
+    :param velocity: (n, 3) [m/s] of the initial points; None: at rest.
+    """
+
+    name: str
+    initial: Chain
+    actions: tuple[Union[NamedAction, Action], ...]
+    goals: tuple[GoalRequest, ...]
+    velocity: Floats | None = None
+
+    def __post_init__(self) -> None:
+        if self.velocity is not None:
+            object.__setattr__(self, 'velocity', frozen_array(self.velocity))
+        names = {name for action in self.actions for name in _hand_names(action)}
+        names.update(name for goal in self.goals for name in goal.held_by or ())
+        for name in names:
+            if not HAND_NAME.fullmatch(name):
+                raise InputError(f'trial {self.name!r}', f'a hand named {name!r}',
+                                 'at most 100 characters without blanks', 'choose another name')
+        self.trial()
+
+    @classmethod
+    def of(cls, trial: Trial) -> TrialRequest:
+        """Return the request of a trial as it was observed."""
+        goals = tuple(GoalRequest(one.chain, one.time, one.stable, one.held_by) for one in trial.goals)
+        return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
+
+    def trial(self, release: bool = True) -> Trial:
+        """
+        Return the trial, in which all actions are what hands did.
+
+        :param release: hands that follow explicit paths open at their last waypoint, where
+            a goal does not say who holds it.
+        :raises InputError: where an action cannot be done.
+        """
+        done: list[Action] = []
+        holds: list[tuple[float, tuple[str, ...], bool]] = []
+        for one in sorted(self.actions, key=lambda action: action.start):
+            if isinstance(one, NamedAction):
+                seen = [goal for goal in self.goals if goal.time <= one.start]
+                chain = max(seen, key=lambda goal: goal.time).chain if seen else self.initial
+                action, hold = one.action(chain, done), one.hold
+            else:
+                action, hold = one, not release
+            done.append(action)
+            holds.append((action.end, tuple(hand.name for hand in action.hands), hold))
+        goals = []
+        for goal in self.goals:
+            last = {name: hold for end, names, hold in holds if end < goal.time for name in names}
+            held_by = goal.held_by
+            if held_by is None:
+                held_by = tuple(name for name, hold in last.items() if hold)
+            goals.append(Goal(goal.chain, goal.time, goal.stable, held_by))
+        return Trial(self.name, self.initial, tuple(done), tuple(goals), self.velocity)
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    What to calibrate.
+
+    :param options: those given, by name; with the mass, if it is known [kg].
+    :param name: of the object.
+    """
+
+    trials: tuple[TrialRequest, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.trials:
+            raise InputError(WHAT, 'no trial', 'at least one', 'add a trial')
+        Options.of(self.options)
+        object.__setattr__(self, 'trials', tuple(self.trials))
+        object.__setattr__(self, 'options', MappingProxyType(dict(self.options)))
+
+    @cached_property
+    def document(self) -> bytes:
+        """The request as an XML document in UTF-8."""
+        root = new_root(ROOT)
+        settings = {name: value for name, value in self.options.items() if name != 'mass'}
+        add(root, 'object', name=self.name, mass=self.options.get('mass'))
+        add_options(root, 'settings', settings)
+        for trial in self.trials:
+            element = add(root, 'trial', name=trial.name)
+            add_chain(element, 'initial_chain', trial.initial)
+            if trial.velocity is not None:
+                velocity = add(element, 'velocity')
+                for x, y, z in trial.velocity.tolist():
+                    add(velocity, 'vector', x=x, y=y, z=z)
+            for action in trial.actions:
+                _add_action(element, action)
+            for goal in trial.goals:
+                add_chain(element, 'goal_chain', goal.chain, time=goal.time, stable=goal.stable,
+                          held_by=goal.held_by)
+        return document(root)
+
+
+def write_request(path: str | Path, request: Request) -> None:
+    """
+    Write a request to an XML file.
+
+    :raises InputError: where the file cannot be written.
+    """
+    write_octets(path, request.document, WHAT)
+
+
+def read_request(path: str | Path) -> Request:
+    """
+    Read a request file.
+
+    :raises InputError: where it cannot be read, or is not such a document;
+        the text names the line and the element.
+    """
+    return request_of(read_octets(path, WHAT, 'a calibration request'), f'{WHAT} {path}')
+
+
+def request_of(octets: bytes, where: str = WHAT) -> Request:
+    """
+    Read a document.
+
+    :param where: names it in refusals.
+    :raises InputError: where it is not such a document.
+    """
+    root = parse(octets, where, ROOT)
+    of_object, settings, *trials = root
+    options = read_options(where, settings)
+    if 'mass' in options:
+        raise refused(where, settings, "an option 'mass'", 'the mass as an attribute of <object>', 'move it')
+    if of_object.get('mass') is not None:
+        options['mass'] = number(where, of_object, 'mass')
+        try:
+            Options.of({'mass': options['mass']})
+        except InputError as error:
+            raise refused(where, of_object, f'mass {error.came}', error.expected, error.remedy) from error
+    try:
+        return Request(tuple(_trial(where, trial) for trial in trials), options, of_object.get('name'))
+    except InputError as error:
+        raise _placed(where, settings, error) from error
+
+
+def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
+    """
+    Return the trials of a request, and why some of it is not used.
+
+    :param options: `length_tolerance` and `release` count here.
+    """
+    trials, refusals = [], []
+    for one in request.trials:
+        trial = one.trial(options.release)
+        length = trial.initial.length
+        change = max(abs(goal.chain.length - length) / length * 100 for goal in trial.goals)
+        if change > options.length_tolerance:
+            refusals.append(str(InputError(
+                f'trial {trial.name!r}', f'a goal chain whose length differs by {change:.0f} %',
+                f'at most {options.length_tolerance:g} % (length_tolerance)',
+                'check that both chains run along the whole DLO, in metres')))
+        else:
+            trials.append(trial)
+    return tuple(trials), tuple(refusals)
+
+
+def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:
+    if isinstance(action, NamedAction):
+        return action.hand_names
+    return tuple(hand.name for hand in action.hands)
+
+
+def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
+    if isinstance(action, NamedAction):
+        values = {one.name: getattr(action, one.name) for one in fields(action) if one.name not in LAST}
+        add(parent, action.name, **values, **{name: getattr(action, name) for name in LAST})
+        return
+    paths = add(parent, PATHS)
+    for hand in action.hands:
+        element = add(paths, 'hand', name=hand.name, grips=hand.grips)
+        turns = (hand.orientations != NO_ROTATION).any(axis=1)
+        for time, (x, y, z), turn, turned in zip(hand.times.tolist(), hand.positions.tolist(),
+                                                 hand.orientations.tolist(), turns, strict=True):
+            add(element, 'waypoint', time=time, x=x, y=y, z=z,
+                **(dict(zip(TURNS, turn, strict=True)) if turned else {}))
+
+
+def _placed(where: str, element: Any, error: InputError) -> InputError:
+    """Return an error with its place in the file."""
+    if error.thing.startswith(where):
+        return error
+    return refused(where, element, f'{error.thing}: {error.came}', error.expected, error.remedy)
+
+
+def _trial(where: str, element: Any) -> TrialRequest:
+    goals = tuple(_goal(where, one) for one in element.findall('goal_chain'))
+    velocity = element.find('velocity')
+    actions = tuple(_action(where, one) for one in element if one.tag == PATHS or one.tag in NAMED_ACTIONS)
+    initial = read_chain(where, element.find('initial_chain'))
+    try:
+        return TrialRequest(element.get('name'), initial, actions, goals,
+                            None if velocity is None else read_vectors(where, velocity))
+    except InputError as error:
+        raise _placed(where, element, error) from error
+
+
+def _goal(where: str, element: Any) -> GoalRequest:
+    held_by = element.get('held_by')
+    return GoalRequest(read_chain(where, element), number(where, element, 'time'),
+                       element.get('stable', 'true') == 'true',
+                       None if held_by is None else tuple(held_by.split()))
+
+
+def _action(where: str, element: Any) -> Union[NamedAction, Action]:
+    try:
+        if element.tag == PATHS:
+            return Action(tuple(_hand(where, hand) for hand in element))
+        kind = NAMED_ACTIONS[element.tag]
+        types = {one.name: str(one.type) for one in fields(kind)}
+        return kind(**{name: _value(where, element, name, types[name]) for name in element.attrib})
+    except InputError as error:
+        raise _placed(where, element, error) from error
+
+
+def _hand(where: str, element: Any) -> Hand:
+    turns = []
+    for waypoint in element:
+        given = [name for name in TURNS if waypoint.get(name) is not None]
+        if given and len(given) < len(TURNS):
+            raise refused(where, waypoint, f'only {" ".join(given)}', 'all of qx qy qz qw, or none')
+        turns.append([number(where, waypoint, name) for name in TURNS] if given else NO_ROTATION)
+    try:
+        return Hand(element.get('name'), tuple(int(one) for one in element.get('grips').split()),
+                    np.array([number(where, waypoint, 'time') for waypoint in element]),
+                    read_vectors(where, element), np.array(turns, dtype=float))
+    except InputError as error:
+        raise _placed(where, element, error) from error
+
+
+def _value(where: str, element: Any, name: str, kind: str) -> Any:
+    """Return an attribute of a named action, as the type of the field of its dataclass says."""
+    text = element.get(name)
+    if kind == 'bool':
+        return text == 'true'
+    if kind == 'str':
+        return text
+    if kind.startswith('int'):
+        return int(text)
+    if kind.startswith('tuple[str'):
+        return tuple(text.split())
+    if kind.startswith('tuple[int'):
+        return tuple(int(one) for one in text.split())
+    if kind.startswith('Numbers'):
+        return tuple(finite(where, element, name, one) for one in text.split())
+    return finite(where, element, name, text)

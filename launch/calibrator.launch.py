@@ -1,0 +1,49 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Start the calibrator with its parameter file, and RViz where it is asked for.
+
+    ros2 launch dlo_calibration calibrator.launch.py rviz:=true params_file:=my_calibrator.yaml
+"""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    """Describe what to start."""
+    config = Path(get_package_share_directory('dlo_calibration')) / 'config'
+    return LaunchDescription([
+        DeclareLaunchArgument(
+            'params_file', default_value=str(config / 'calibrator.yaml'),
+            description='parameters of the node; copy the default and change the copy'),
+        DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
+                              description='start RViz too (the package rviz2)'),
+        DeclareLaunchArgument('frame', default_value='world',
+                              description='frame_id of the chains, which RViz shows'),
+        Node(package='dlo_calibration', executable='calibrator', name='calibrator', output='screen',
+             # not `parameters`, which only warns of a file that is not there
+             ros_arguments=['--params-file', LaunchConfiguration('params_file')]),
+        Node(package='rviz2', executable='rviz2', name='rviz2',
+             arguments=['-d', str(config / 'calibrator.rviz'), '-f', LaunchConfiguration('frame')],
+             condition=IfCondition(LaunchConfiguration('rviz'))),
+    ])

@@ -1,0 +1,48 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A live node in the process of the test, with the toy as its engine."""
+
+from contextlib import contextmanager
+
+from toy_simulator import ToySimulator
+
+QUICK = {'evaluations': 4, 'workers': 1}
+LOG_WARN = 30  # rcl_interfaces/msg/Log
+
+
+@contextmanager
+def live_node(environment, folder, toy=None, **parameters):
+    """Give the robot of `test_node` with a node in this process; skip where there is no ROS."""
+    import test_node
+
+    with test_node.robot_of(environment) as robot:
+        robot.calibrator = test_node.CalibratorNode(
+            lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
+                test_node.Parameter(name, value=value)
+                for name, value in {**QUICK, 'output_directory': str(folder), **parameters}.items()])
+        robot.executor.add_node(robot.calibrator)
+        try:
+            robot.matched()
+            yield robot
+        finally:
+            robot.calibrator.close()
+
+
+def robot_types():
+    """Return the message classes of the graph."""
+    from test_node import TYPES
+
+    return TYPES

@@ -1,0 +1,245 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Definitions of a DLO: exact there and back, and nothing read that should not be."""
+
+from dataclasses import asdict, replace
+import re
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lxml import etree
+import numpy as np
+import pytest
+from toy_simulator import toy_trial, ToySimulator
+
+from dlo_calibration.calibration import calibrate, Evaluator
+from dlo_calibration.chain import Chain
+from dlo_calibration.config import Options
+from dlo_calibration.description import (
+    Description,
+    description_document,
+    read_description,
+    read_result,
+    write_result,
+)
+from dlo_calibration.errors import InputError
+from dlo_calibration.parameters import PARAMETERS, ParameterSpace
+from dlo_calibration.search.random import RandomSearch
+
+OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
+TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collision': 20.0}
+
+
+def calibrated(seed=1, mass=0.1 + 0.2):
+    space = ParameterSpace(('friction', 'flexibility'), {'elasticity': 100 / 3, 'damping': 1 / 3}, mass)
+    trials = [toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=0.3)]
+    return calibrate(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
+
+
+@pytest.fixture(scope='module')
+def result():
+    return calibrated()
+
+
+@pytest.fixture
+def file(tmp_path, result):
+    """Give the path of a result file that can be read."""
+    write_result(tmp_path / 'result.xml', result, OPTIONS.flat())
+    return tmp_path / 'result.xml'
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('mass', [0.0, 0.1 + 0.2])
+def test_same_physical_values_bit_for_bit(tmp_path, seed, mass):
+    result = calibrated(seed, mass)
+    write_result(tmp_path / 'result.xml', result)
+    found = read_result(tmp_path / 'result.xml')
+    assert found.values == result.values
+    assert found.physical() == result.physical()
+    assert (found.space.free, found.space.mass) == (result.space.free, result.space.mass)
+
+
+def test_value_of_a_found_parameter_in_the_options_does_not_count(tmp_path):
+    space = Options.of({'calibrate': ['friction'], 'friction': 12.0, 'damping': 80.0}).space
+    result = calibrate([toy_trial(TRUTH)], space, ToySimulator(), RandomSearch(1, 1), budget=3)
+    write_result(tmp_path / 'result.xml', result)
+    found = read_result(tmp_path / 'result.xml')
+    assert found.physical() == result.physical()
+    assert 'friction' not in found.fixed and found.fixed['damping'] == 80.0
+
+
+def test_same_simulation_bit_for_bit(file, result):
+    found = read_result(file)
+    rollouts = Evaluator(result.trials, found.space, ToySimulator()).simulate(found.values)
+    for rollout, goals, trial in zip(rollouts, result.chains, result.trials, strict=True):
+        np.testing.assert_allclose(rollout.chains, goals, atol=1e-12)
+        first, = Evaluator([trial], result.space, ToySimulator()).simulate(result.values)
+        np.testing.assert_array_equal(rollout.chains, first.chains)
+
+
+def test_everything_else_comes_back(file, result):
+    found = read_result(file)
+    assert {name: asdict(p) for name, p in found.parameters.items()} == {
+        name: asdict(p) for name, p in result.parameters.items()}
+    assert list(found.parameters) == ['friction', 'flexibility']
+    assert (found.score, found.scores, found.errors) == (result.best.score, result.best.scores, result.errors)
+    assert (found.search, found.engine, found.seed) == ('random', 'toy', 1)
+    assert (found.evaluations, found.simulations, found.stop_reason, found.seconds) == (
+        20, 40, result.stop_reason, result.seconds)
+    assert (found.trials, found.warnings) == (('trial 1', 'trial 2'), result.warnings)
+    np.testing.assert_array_equal(found.chain.points, result.trials[0].initial.points)
+    assert found.chain.hands is None and not found.chain.features.any()
+    assert Options.of(found.options) == OPTIONS
+
+
+def test_writing_what_was_read_gives_the_same_bytes(file):
+    assert description_document(read_result(file)) == file.read_bytes()
+
+
+def test_document_is_for_people_too(file):
+    lines = file.read_text(encoding='utf-8').splitlines()
+    assert lines[0] == "<?xml version='1.0' encoding='UTF-8'?>"
+    assert any(re.fullmatch(r' +<found name="flexibility" value="[0-9.]+".*/>', line) for line in lines)
+
+
+@settings(max_examples=200, deadline=None)
+@given(text=st.text(max_size=30), value=st.floats(0, 100), length=st.floats(1e-6, 1e6))
+def test_any_text_and_number_survives(tmp_path_factory, result, text, value, length):
+    path = tmp_path_factory.mktemp('any') / 'result.xml'
+    flexibility = replace(result.parameters['flexibility'], value=value, physical_unit=text)
+    given_file = replace(Description.of(result), parameters={'flexibility': flexibility}, length=length,
+                         stop_reason=text, warnings=(text,))
+    write_result(path, given_file)
+    found = read_result(path)
+    assert (found.values, found.length) == ({'flexibility': value}, length)
+    printable = ''.join(c if c in '\t\n\r' or ' ' <= c < '\ufffe' or c > '\uffff' else '\ufffd' for c in text)
+    printable = re.sub('[\ud800-\udfff]', '\ufffd', printable)
+    assert found.stop_reason == found.parameters['flexibility'].physical_unit == printable
+    assert found.warnings == (printable,)
+
+
+def refused(path, match):
+    with pytest.raises(InputError, match=match) as caught:
+        read_result(path)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize('change, match', [
+    (('version="1"', 'version="2"'), "<dlo>.*version.*'2'.*expected one of '1'"),
+    (('<dlo version="1"', '<dlo version="1" more="1"'), "<dlo>.*'more'"),
+    (('<calibration ', '<calibration colour="red" '), '<calibration>.*colour'),
+    (('<fixed name="elasticity" value="', '<fixed name="elasticity" value="9'), '<fixed>.*value.*0 to 100'),
+    (('<fixed name="elasticity" value="3', '<fixed name="elasticity" value="4'), '<fixed>.*not what'),
+    (('physical_unit="s"/>', 'physical_unit="ms"/>'), '<fixed>.*ms.*expected.* s'),
+    (('<found name="friction" value="', '<found name="friction" value="1e9'), '<found>.*value'),
+    (('<found name="friction" value="', '<found name="friction" value="x'), '<found>.*value.*a finite'),
+    (('<found name="friction"', '<found'), '<found>.*name'),
+    (('score="', 'score="nan'), 'score'),
+    (('score="', 'score="1e999" x="'), '<fit>.*x'),
+    (('<point x="0.0"', '<point x="inf"'), '<point>.*x'),
+    (('<point x="0.0"', '<point x="1e999"'), '<point>.*x.*1e999'),
+    (('<point x="0.0"', '<point hand="256" x="0.0"'), '<point>.*hand.*256'),
+    (('seed="1"', 'seed="1.5"'), '<calibration>.*seed'),
+    (('mass="', 'mass="-'), 'mass'),
+    (('identifiable="', 'identifiable="per'), 'identifiable'),
+    (('<options>', '<options>text'), '<options>'),
+    (('<warnings/>', '<warnings/><warnings/>'), '<warnings>'),
+    (('name="seed" value="1"', 'name="seed" value="{"'), '<option>.*seed.*an integer'),
+    (('name="seed" value="1"', 'name="weed" value="1"'), '<option>.*weed'),
+    (('name="table" value="true"', 'name="table" value="yes"'), '<option>.*table.*true or false'),
+])
+def test_unexpected_is_refused_by_line_and_element(file, change, match):
+    text = file.read_text(encoding='utf-8')
+    line = text[:text.index(change[0])].count('\n') + 1
+    file.write_text(text.replace(*change, 1), encoding='utf-8')
+    assert f', line {line}, element <' in refused(file, match)
+
+
+@pytest.mark.parametrize('change, match', [
+    (('<point x="0.0"', '<point hand="1" x="0.0"'), '<point>.*hand'),
+    (('<fit ', '<hunt '), 'no XML document|<hunt>'),
+    (('<fixed name="damping"', '<fixed name="friction"'), '<fixed>.*friction.*twice'),
+    (('<fixed name="damping"', '<fixed name="weight"'), 'weight'),
+    (('<fixed name="damping"', '<fixed name="elasticity"'), '<fixed>.*elasticity.*twice'),
+    (('<found name="friction"', '<found name="flexibility"'), '<found>.*flexibility.*twice'),
+    (('<warnings/>', ''), '<calibration>.*Missing.*warnings'),
+    (('name="seed" value="1"', 'name="evaluations" value="1"'), '<option>.*evaluations.*twice'),
+])
+def test_what_only_the_whole_shows_is_refused(file, change, match):
+    text = file.read_text(encoding='utf-8')
+    assert change[0] in text
+    file.write_text(text.replace(*change, 1), encoding='utf-8')
+    assert ', line ' in refused(file, match)
+
+
+@pytest.mark.parametrize('path, attribute', [
+    ('parameters/found', 'value'), ('.', 'length'), ('calibration', 'search'), ('chain/point', 'x')])
+def test_missing_attribute_is_named(file, path, attribute):
+    tree = etree.parse(str(file))
+    element = tree.find(path)
+    del element.attrib[attribute]
+    line = element.sourceline
+    tree.write(str(file), xml_declaration=True, encoding='UTF-8')
+    refused(file, f"line {line}, element <{element.tag}>.*'{attribute}'")
+
+
+def test_hand_written_description_keeps_its_annotations(result):
+    hands = np.zeros(11, np.uint8)
+    hands[[0, 1]] = 2
+    chain = Chain(result.trials[0].initial.points, hands, np.arange(11) == 4)
+    found = read_description(description_document(replace(Description.of(result), chain=chain)))
+    np.testing.assert_array_equal(found.chain.hands, hands)
+    np.testing.assert_array_equal(np.flatnonzero(found.chain.features), [4])
+
+
+def test_text_of_a_message_is_read_too(result):
+    octets = description_document(result)
+    assert read_description(octets.decode()).values == result.values
+    with pytest.raises(InputError, match='dlo_description, line 1'):
+        read_description('no document')
+
+
+def test_fixed_values_are_complete_and_in_units(result):
+    found = read_description(description_document(result))
+    assert set(found.fixed) | set(found.values) == {one.name for one in PARAMETERS} - {'mass'}
+    element = etree.fromstring(description_document(result)).find('.//fixed[@name="elasticity"]')
+    assert element.get('physical_unit') == 'N'
+    assert float(element.get('physical_value')) == pytest.approx(result.physical()['elasticity'])
+
+
+def test_path_without_file_is_refused(tmp_path):
+    refused(tmp_path / 'missing.xml', 'missing.xml')
+    refused(tmp_path, 'result file')
+
+
+def test_place_that_cannot_be_written_is_refused(tmp_path, result):
+    with pytest.raises(InputError, match='result.xml'):
+        write_result(tmp_path / 'missing' / 'result.xml', result)
+
+
+@settings(max_examples=200, deadline=None)
+@given(place=st.floats(0, 1), octets=st.binary(max_size=6))
+def test_damaged_anywhere_is_read_or_refused(tmp_path_factory, result, place, octets):
+    document = bytearray(description_document(result, OPTIONS.flat()))
+    at = int(place * len(document))
+    document[at:at + len(octets)] = octets
+    path = tmp_path_factory.mktemp('damaged') / 'result.xml'
+    path.write_bytes(document)
+    try:
+        read_result(path)
+    except InputError as error:
+        assert str(path) in str(error)

@@ -1,0 +1,54 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""The examples do what they say, with the node."""
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from dlo_calibration.session import read_session
+
+pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
+
+from test_node import child, ended  # noqa: E402
+
+EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
+PATIENCE = 60.0  # s
+
+
+def robot_session(environment):
+    done = subprocess.run([sys.executable, EXAMPLES / 'robot_session.py'], env=environment, text=True,
+                          capture_output=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+def test_robot_session_sends_a_trial_starts_and_hears_the_result(ros_environment, tmp_path):
+    with child(ros_environment, tmp_path / 'out', '-p', 'evaluations:=5') as process:
+        heard = robot_session(ros_environment)
+        again = robot_session(ros_environment)
+        process.send_signal(signal.SIGINT)
+        assert ended(process) == 0
+    for name in ('flexibility', 'elasticity', 'friction', 'self_collision', 'calibration'):
+        assert f'[robot]: {name}: ' in heard
+    assert 'calibrating on 1 trial(s), 5 evaluations' in heard
+    assert 'calibrating on 2 trial(s), 5 evaluations' in again
+    folder, = (tmp_path / 'out').iterdir()
+    assert len(read_session(folder).messages) == 6

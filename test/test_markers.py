@@ -1,0 +1,157 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Markers show the trials in the frame of the session, and what was simulated of them, on both wires."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials, TRUTH
+from toy_simulator import toy_trial, ToySimulator
+from wire import wire
+
+from dlo_calibration.calibration import calibrate
+from dlo_calibration.chain import Chain
+from dlo_calibration.markers import error_colour, markers, MOST_POINTS
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.search import RandomSearch
+from dlo_calibration.trial import Goal, INSTANTS
+
+STAMP = 12_500_000_000
+ADD, DELETE_ALL = 0, 3
+LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 4, 5, 7, 9
+
+
+@pytest.fixture(scope='module')
+def result():
+    return calibrate(toy_trials(2), ParameterSpace(), ToySimulator(), RandomSearch(4, seed=1), budget=5)
+
+
+def shown(types, trials, result=None):
+    """Return markers by namespace, after the wire."""
+    array = wire(types)(markers(types, trials, stamp=STAMP, frame_id='table', result=result))
+    first, *rest = array.markers
+    assert (first.action, first.header.frame_id) == (DELETE_ALL, 'table')
+    found = {}
+    for marker in rest:
+        found.setdefault(marker.ns, []).append(marker)
+    return found
+
+
+def points(marker):
+    return np.array([[p.x, p.y, p.z] for p in marker.points])
+
+
+def test_collected_trials_show_initial_and_goal_chains_and_hands(types):
+    trials = toy_trials(2)
+    found = shown(types, trials)
+    assert set(found) == {f'trial_{k}/{name}' for k in (1, 2)
+                          for name in ('initial', 'goal', 'hands', 'label')}
+    for k, trial in enumerate(trials, start=1):
+        initial, = found[f'trial_{k}/initial']
+        assert np.array_equal(points(initial), trial.initial.points)
+        for goal in found[f'trial_{k}/goal']:
+            assert np.array_equal(points(goal), trial.goals[0].chain.points)
+        label, = found[f'trial_{k}/label']
+        assert (label.type, label.text) == (TEXT, trial.name)
+
+
+def test_every_marker_can_be_seen_and_stays(types, result):
+    for markers_of_space in shown(types, result.trials, result).values():
+        for marker in markers_of_space:
+            assert (marker.action, marker.header.frame_id) == (ADD, 'table')
+            assert (marker.lifetime.sec, marker.lifetime.nanosec) == (0, 0)
+            assert marker.color.a == 1
+            assert min(marker.scale.x, marker.scale.y, marker.scale.z) > 0
+            assert marker.pose.orientation.w == 1
+            assert len(marker.colors) in (0, len(marker.points))
+            assert marker.type != LINE_STRIP or len(marker.points) > 1
+            assert marker.type != LINE_LIST or len(marker.points) % 2 == 0
+
+
+def test_result_shows_the_simulated_chain_and_the_error_of_each_point(types, result):
+    found = shown(types, result.trials, result)
+    for k, (trial, chains) in enumerate(zip(result.trials, result.chains, strict=True), start=1):
+        simulated, = found[f'trial_{k}/simulated']
+        assert np.allclose(points(simulated), chains[0])
+        spheres, lines = found[f'trial_{k}/error']
+        assert (spheres.type, lines.type) == (SPHERE_LIST, LINE_LIST)
+        errors = np.linalg.norm(chains[0] - trial.goals[0].chain.points, axis=1)
+        greens = np.array([colour.g for colour in spheres.colors])
+        assert (np.diff(greens[np.argsort(errors)]) <= 1e-6).all()
+        ends = points(lines).reshape(-1, 2, 3)
+        assert np.allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), errors)
+        label, = found[f'trial_{k}/label']
+        assert f'max {errors.max() * 1e3:.1f} mm' in label.text
+
+
+def test_trial_that_came_after_the_result_is_shown_as_measured(types, result):
+    trials = [*result.trials, toy_trial(TRUTH, 'trial 3', turn=1.0)]
+    found = shown(types, trials, result)
+    assert 'trial_2/simulated' in found
+    assert 'trial_3/goal' in found
+    assert 'trial_3/simulated' not in found
+
+
+def test_trial_that_only_has_the_name_of_one_of_the_result_is_shown_as_measured(types, result):
+    other = toy_trial(TRUTH, result.trials[0].name, turn=2.0)
+    assert 'trial_1/simulated' not in shown(types, [other], result)
+
+
+def test_same_thing_has_the_same_id_in_every_message_and_no_two_share_one(types, result):
+    before = {(m.ns, m.id): m.type for ms in shown(types, result.trials).values() for m in ms}
+    after = [((m.ns, m.id), m.type) for ms in shown(types, result.trials, result).values() for m in ms]
+    assert len(dict(after)) == len(after)
+    assert before.items() <= dict(after).items()
+
+
+def test_of_many_goals_a_few_instants_are_shown_the_last_always(types):
+    trial, = toy_trials(1)
+    goals = [Goal(Chain(trial.initial.points + (0, 0, 0.01 * k)), 0.02 * k, stable=False) for k in range(60)]
+    found = shown(types, [replace(trial, goals=goals)])
+    lines = [marker for marker in found['trial_1/goal'] if marker.type == LINE_STRIP]
+    assert len(lines) == INSTANTS
+    assert any(np.allclose(points(marker), goals[-1].chain.points) for marker in lines)
+
+
+def test_of_many_points_two_hundred_are_shown_from_the_first_to_the_last(types):
+    trial = toy_trial(TRUTH, n=5000)
+    initial, = shown(types, [trial])['trial_1/initial']
+    assert len(initial.points) == MOST_POINTS
+    assert np.array_equal(points(initial)[[0, -1]], trial.initial.points[[0, -1]])
+
+
+def test_no_trials_clear_what_was_shown(types):
+    assert shown(types, []) == {}
+
+
+def test_hand_shows_its_path_what_it_grips_and_where_it_opens(types):
+    trial, = toy_trials(1)
+    hand = trial.hands[0]
+    path, grip, end = shown(types, [trial])['trial_1/hands']
+    assert np.allclose(points(path)[[0, -1]], hand.positions[[0, -1]])
+    assert np.array_equal(points(grip), trial.initial.points[list(hand.grips)])
+    position = end.pose.position
+    assert np.allclose([position.x, position.y, position.z], hand.positions[-1])
+
+
+def test_errors_go_from_green_over_yellow_to_red():
+    assert error_colour(0.0)[:2] == (0.0, 1.0)
+    assert error_colour(0.015)[:2] == (1.0, 1.0)
+    for share in (0.03, 1.0, math.inf):
+        assert error_colour(share)[:2] == (1.0, 0.0)

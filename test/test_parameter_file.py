@@ -1,0 +1,94 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""The parameter file has every parameter with its default and a comment, and the node starts with it."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+from ruamel.yaml import YAML
+
+from dlo_calibration.config import declarations, Options
+from dlo_calibration.parameter_file import parameter_file
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE = ROOT / 'config' / 'calibrator.yaml'
+
+
+def test_file_is_what_the_documented_command_makes():
+    done = subprocess.run([sys.executable, '-m', 'dlo_calibration.parameter_file'], cwd=ROOT, check=True,
+                          capture_output=True, text=True)
+    assert done.stdout == FILE.read_text(encoding='utf-8'), \
+        'make it again: python -m dlo_calibration.parameter_file > config/calibrator.yaml'
+
+
+def test_file_has_every_parameter_with_its_default():
+    values = YAML(typ='safe').load(parameter_file())['/**']['ros__parameters']
+    assert list(values) == [declaration.name for declaration in declarations()]
+    assert Options.of(values) == Options()
+    for declaration in declarations():
+        value = values[declaration.name]
+        assert type(value) is (list if isinstance(declaration.default, tuple) else type(declaration.default))
+
+
+@pytest.mark.parametrize('declaration', list(declarations()), ids=lambda declaration: declaration.name)
+def test_comment_tells_meaning_unit_and_range(declaration):
+    lines = parameter_file().splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith(f'    {declaration.name}: '))
+    comment = []
+    while (line := lines[at - 1 - len(comment)]).startswith('    # '):
+        comment.insert(0, line[len('    # '):].strip())
+    text = ' '.join(comment)
+    assert declaration.description[1:] in text
+    assert declaration.unit in text
+    for choice in declaration.choices:
+        assert choice in text
+    if declaration.minimum is not None:
+        assert f'{declaration.minimum:g} to ' in text
+        low, high = text.split('From ')[-1].split(' to ')
+        assert float(low) == declaration.minimum
+        assert float(high.rstrip('.').split()[0]) == pytest.approx(declaration.maximum, rel=1e-5)
+
+
+def test_no_line_is_too_long_to_read():
+    assert max(len(line) for line in parameter_file().splitlines()) <= 110
+
+
+def test_node_starts_with_the_file_and_takes_what_was_changed_in_it(ros_environment, tmp_path):
+    rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
+    pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
+    from rclpy.context import Context
+    from rclpy.signals import SignalHandlerOptions
+
+    from dlo_calibration.node import CalibratorNode
+
+    text = FILE.read_text(encoding='utf-8').replace('output_directory: "."',
+                                                    f'output_directory: "{tmp_path}"')
+    changed = text.replace('evaluations: 150', 'evaluations: 7').replace('mass: 0.0', 'mass: 0.25')
+    for name, content, expected in (
+            ('same.yaml', text, {}), ('changed.yaml', changed, {'evaluations': 7, 'mass': 0.25})):
+        (tmp_path / name).write_text(content, encoding='utf-8')
+        context = Context()
+        rclpy.init(args=['--ros-args', '--params-file', str(tmp_path / name)], context=context,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            node = CalibratorNode(context=context)
+            assert node.options() == Options.of({'output_directory': str(tmp_path), **expected})
+            node.close()
+        finally:
+            context.try_shutdown()

@@ -1,0 +1,197 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Pictures are drawn for whatever trials there are, and show what differs."""
+
+from dataclasses import replace
+import io
+
+import numpy as np
+from PIL import Image
+import pytest
+from toy_messages import toy_trials
+
+from dlo_calibration import Action, Chain, Goal, Hand, InputError
+from dlo_calibration.animation import densely, MOST_FRAMES, simulated_motion, write_animation
+from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture, trial_png
+from dlo_calibration.rollout import roll_out, Settling
+from dlo_calibration.simulator import Rollout
+from dlo_calibration.trial import shown_goals, Trial
+
+
+def chains_of(trial, shift=0.0):
+    return np.stack([goal.chain.points + (0, 0, shift) for goal in trial.goals])
+
+
+def tracked(count):
+    """Return a trial that was observed at many instants."""
+    trial, = toy_trials(1)
+    goals = [Goal(Chain(trial.initial.points + (0, 0, 0.01 * k)), 0.05 * k, stable=False)
+             for k in range(count)]
+    return replace(trial, goals=goals)
+
+
+def pixels(trial, chains):
+    return np.asarray(Image.open(io.BytesIO(trial_png(trial, chains))).convert('RGB')).astype(int)
+
+
+def orange(image):
+    """Count pixels of the colour of what is simulated."""
+    return int((np.abs(image - (255, 127, 14)).sum(axis=2) < 30).sum())
+
+
+def test_simulated_chain_is_drawn_where_there_is_one():
+    trial, = toy_trials(1)
+    assert orange(pixels(trial, None)) == 0
+    assert orange(pixels(trial, chains_of(trial, 0.05))) > 500
+
+
+def test_picture_of_a_session_has_a_row_per_trial(tmp_path):
+    trials = toy_trials(3)
+    trial_picture(trials[0], chains_of(trials[0]), tmp_path / 'one.png')
+    session_picture(trials, [chains_of(trial) for trial in trials], tmp_path / 'all.png')
+    one, all_three = Image.open(tmp_path / 'one.png'), Image.open(tmp_path / 'all.png')
+    assert one.width == all_three.width
+    assert 2.5 * one.height < all_three.height < 3.1 * one.height
+
+
+def test_picture_does_not_depend_on_what_was_drawn_before():
+    first, second = toy_trials(2)
+    once = trial_png(first, chains_of(first))
+    trial_png(second, None)
+    assert trial_png(first, chains_of(first)) == once
+
+
+@pytest.mark.parametrize('trial', [
+    tracked(40),
+    Trial('straight up', Chain([[0, 0, 0], [0, 0, 1], [0, 0, 2.0]]),
+          (Action((Hand('h', (0,), [0.0], [[0, 0, 0]]),)),),
+          (Goal(Chain([[0, 0, 0], [0, 0, 1], [0, 0, 2.0]]), 1.0),)),
+    Trial('eight hands $_{$', Chain(np.eye(3)[[0] * 9] * np.arange(1, 10)[:, None]),
+          (Action(tuple(Hand(f'_$^$_{k}', (k, k + 1), [0.0, 1.0], np.eye(3)[:2] * k) for k in range(8))),),
+          (Goal(Chain(np.eye(3)[[1] * 9] * np.arange(1, 10)[:, None]), 2.0),)),
+], ids=lambda trial: trial.name)
+def test_picture_of_unusual_trials(trial):
+    for chains in (None, chains_of(trial, 0.01)):
+        assert pixels(trial, chains).std() > 10
+
+
+def test_file_that_cannot_be_written_is_an_input_error(tmp_path):
+    trial, = toy_trials(1)
+    with pytest.raises(InputError, match='--output'):
+        trial_picture(trial, None, tmp_path / 'none' / 'one.png')
+
+
+def test_side_view_looks_along_the_trial():
+    direction = horizontal_direction(toy_trials(1)[0])
+    assert direction[2] == 0
+    assert np.linalg.norm(direction) == pytest.approx(1)
+    assert abs(direction[0]) > 0.9
+
+
+@pytest.mark.parametrize('count', [1, 2, 5, 6, 500])
+def test_few_goals_are_shown_the_last_always(count):
+    chosen = shown_goals(count)
+    assert chosen[-1] == count - 1
+    assert len(chosen) == min(count, 5)
+    assert chosen == sorted(set(chosen))
+
+
+class Following:
+    """A simulator whose points go with time: at an instant t, the chain is t higher; at rest, 9 higher."""
+
+    name = 'following'
+
+    def simulate(self, trial, physical):
+        chains = [trial.initial.points + (0, 0, 9.0 if goal.stable else goal.time) for goal in trial.goals]
+        return Rollout(np.stack(chains), (True,) * len(chains), 1.0, 100)
+
+    def close(self):
+        """Hold nothing."""
+
+
+def test_motion_has_the_simulated_chains_over_time_and_those_at_the_goals():
+    trial, = toy_trials(1)
+    motion = simulated_motion(trial, Following(), {})
+    assert (np.diff(motion.times) > 0).all()
+    assert motion.times[0] == 0
+    assert motion.times[-1] >= trial.hands[0].end
+    heights = (motion.chains - trial.initial.points)[:, :, 2]
+    assert np.allclose(heights, motion.times[:, None])
+    assert np.allclose(motion.ends[:, :, 2] - trial.initial.points[:, 2], 9.0)
+
+
+@pytest.mark.parametrize('held_by', [(), ('left_hand',)])
+def test_instants_between_change_nothing_of_the_course(held_by):
+    class Held:
+        """Write down which nodes are held, and where."""
+
+        time_step = 0.01
+
+        def __init__(self, points):
+            self._points, self.nodes, self.course = np.array(points), (), []
+
+        @property
+        def points(self):
+            return self._points.copy()
+
+        def hold(self, nodes):
+            self.nodes = nodes
+
+        def advance(self, targets):
+            for target in targets:
+                self._points[list(self.nodes)] = target
+                self.course.append((self.nodes, self._points.copy()))
+
+    from dlo_calibration.layout import Layout
+    trial, = toy_trials(1)
+    trial = replace(trial, goals=(replace(trial.goals[0], held_by=held_by),))
+    courses = []
+    for one in (trial, densely(trial)):
+        layout = Layout.of(one, 11)
+        stepper = Held(layout.points)
+        courses.append((roll_out(one, layout, stepper, Settling()), stepper.course))
+    (plain, before), (dense, after) = courses
+    assert np.allclose(plain.chains[-1], dense.chains[[g.stable for g in densely(trial).goals].index(True)])
+    assert bool(before[-1][0]) == bool(after[-1][0]) == bool(held_by)
+
+
+def test_long_trial_has_no_more_frames_than_a_viewer_can_bear():
+    trial, = toy_trials(1)
+    late = replace(trial, goals=(replace(trial.goals[0], time=3600.0),))
+    assert len(densely(late).goals) <= MOST_FRAMES + 1
+
+
+def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr('dlo_calibration.animation.FRAME_RATE', 5)
+    trial, = toy_trials(1)
+    write_animation(trial, simulated_motion(trial, Following(), {}), tmp_path / 'one.gif')
+    gif = Image.open(tmp_path / 'one.gif')
+    frames, durations = [], []
+    for k in range(gif.n_frames):
+        gif.seek(k)
+        frames.append(np.asarray(gif.convert('RGB')).astype(int))
+        durations.append(gif.info['duration'])
+    assert len(frames) > 6
+    assert all((one != two).any() for one, two in zip(frames[:-1], frames[1:], strict=True))
+    assert durations[-1] > 5 * durations[0]
+    assert sum(durations) / 1e3 > trial.hands[0].end
+
+
+def test_animation_that_cannot_be_written_is_an_input_error(tmp_path):
+    trial = tracked(3)
+    with pytest.raises(InputError, match='--output'):
+        write_animation(trial, simulated_motion(trial, Following(), {}), tmp_path / 'none' / 'one.gif')

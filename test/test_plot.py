@@ -1,0 +1,113 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""The verb `plot`: which files it writes, and what it says."""
+
+import json
+
+import numpy as np
+from PIL import Image
+import pytest
+from toy_messages import session_messages, write_session
+from toy_simulator import ToySimulator
+
+from dlo_calibration import cli
+from dlo_calibration.messages import bag_types
+
+
+@pytest.fixture
+def session(tmp_path):
+    return write_session(tmp_path / 'recorded', session_messages(bag_types(), 2),
+                         {'evaluations': 3, 'workers': 1})
+
+
+@pytest.fixture
+def run(capsys):
+    """Give a function that returns exit code, stdout and stderr of a command with the toy."""
+    def run(*words):
+        try:
+            code = cli.main([str(word) for word in words], lambda options: ToySimulator())
+        except SystemExit as end:  # argparse
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def result(run, session, tmp_path):
+    assert run('fit', session, '--output', tmp_path / 'fitted')[0] == 0
+    return tmp_path / 'fitted' / 'result.xml'
+
+
+def written(folder):
+    return sorted(file.name for file in folder.iterdir())
+
+
+def test_session_alone_gives_a_picture_per_trial(run, session, tmp_path):
+    code, output, notes = run('plot', session, '--output', tmp_path / 'pictures')
+    assert (code, output) == (0, '')
+    assert written(tmp_path / 'pictures') == ['trial_1.png', 'trial_2.png']
+    assert str(tmp_path / 'pictures' / 'trial_2.png') in notes
+
+
+def test_result_is_drawn_too(run, session, result, tmp_path):
+    run('plot', session, '--output', tmp_path / 'measured')
+    code, output, _ = run('plot', session, result, '--output', tmp_path / 'both', '--json')
+    assert code == 0
+    assert json.loads(output) == {
+        'pictures': [str(tmp_path / 'both' / f'trial_{k}.png') for k in (1, 2)], 'animations': []}
+    one, two = (np.asarray(Image.open(tmp_path / name / 'trial_1.png').convert('RGB')).astype(int)
+                for name in ('measured', 'both'))
+
+    def orange(image):
+        return (np.abs(image - (255, 127, 14)).sum(axis=2) < 30).sum()
+
+    assert orange(one) == 0 < orange(two)
+
+
+def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
+    monkeypatch.setattr('dlo_calibration.animation.FRAME_RATE', 2)
+    code, output, _ = run('plot', session, result, '--animation', '--output', tmp_path / 'films', '--json')
+    assert code == 0
+    assert written(tmp_path / 'films') == ['trial_1.gif', 'trial_1.png', 'trial_2.gif', 'trial_2.png']
+    for path in json.loads(output)['animations']:
+        assert Image.open(path).n_frames > 2
+
+
+def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
+    (tmp_path / 'here').mkdir()
+    monkeypatch.chdir(tmp_path / 'here')
+    assert run('plot', session)[0] == 0
+    assert written(tmp_path / 'here') == ['trial_1.png', 'trial_2.png']
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['--animation'], 'RESULT.xml'),
+    (['--output', '{session}/metadata.yaml'], '--output'),
+    (['{session}/metadata.yaml'], 'metadata.yaml'),
+], ids=['animation of nothing', 'folder that is a file', 'result that is none'])
+def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
+    code, output, errors = run('plot', session, *(word.format(session=session) for word in words))
+    assert (code, output, errors.count('\n')) == (2, '', 1)
+    assert said in errors
+
+
+def test_session_without_trials_is_refused(run, tmp_path):
+    initial, *_ = session_messages(bag_types(), 1)
+    code, _, errors = run('plot', write_session(tmp_path / 'short', [initial]))
+    assert code == 2
+    assert 'no complete trial' in errors

@@ -1,0 +1,160 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Every file of msg_samples says what its README says."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_typestore, Stores
+from ruamel.yaml import YAML
+from wire import wire
+
+from dlo_calibration import calibrate, cli, ParameterSpace
+from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.collector import TrialCollector
+from dlo_calibration.config import Options
+from dlo_calibration.messages import ACTION, INPUT_TYPES, read
+from dlo_calibration.search import RandomSearch
+from dlo_calibration.session import read_session
+
+SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'
+DOCUMENTS = ('README.md', 'make_yaml.py', 'make_xml.py')
+SESSIONS = sorted(file.parent for file in SAMPLES.glob('*/metadata.yaml'))
+FIELDS = get_typestore(Stores.ROS2_JAZZY).fielddefs
+
+
+def files(*folders):
+    return {file for folder in folders for file in folder.rglob('*')
+            if file.is_file() and '__pycache__' not in file.parts}
+
+
+def message_file(kind):
+    return SAMPLES / f'{kind}.yaml'
+
+
+def loaded_by_ruamel(text):
+    return YAML(typ='safe').load(text)
+
+
+def loaded_by_pyyaml(text):
+    reader = pytest.importorskip('yaml', reason='PyYAML, with which ros2 topic pub reads, is not installed')
+    return reader.safe_load(text)
+
+
+def filled(types, name, values):
+    """Build a message of type `name` from a mapping, as ros2 topic pub does; nothing unknown is allowed."""
+    def value(what, given):
+        node, rest = what
+        if node == Nodetype.NAME:
+            return filled(types, rest, given)
+        if node == Nodetype.SEQUENCE:
+            element, _ = rest
+            return types.octets(bytes(given)) if element == (Nodetype.BASE, ('uint8', 0)) else \
+                [value(element, one) for one in given]
+        return given
+
+    fields = dict(FIELDS[name][1])
+    assert values.keys() <= fields.keys()
+    # What is left out is empty; anything else that is left out would be an error here.
+    values = {**{key: [] for key, what in fields.items() if what[0] == Nodetype.SEQUENCE}, **values}
+    return types.build(name, **{key: value(what, values[key]) for key, what in fields.items()})
+
+
+def sample_messages(types, load=loaded_by_ruamel):
+    """Return the (kind, message object) of the YAML files, after a journey over the wire."""
+    travel = wire(types)
+    return [(kind, travel(filled(types, name, load(message_file(kind).read_text(encoding='utf-8')))))
+            for kind, name in INPUT_TYPES.items()]
+
+
+def sample_trials(messages):
+    collector = TrialCollector(Options())
+    for kind, message in messages:
+        collector.add(read(kind, message))
+    return collector.trials
+
+
+def test_every_file_is_used():
+    known = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
+    assert files(SAMPLES) == known | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
+    readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
+    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES), *(one.name for one in SESSIONS)):
+        assert name in readme
+
+
+@pytest.mark.parametrize('load', [loaded_by_ruamel, loaded_by_pyyaml])
+def test_yaml_messages_in_any_order_are_one_complete_trial(types, load):
+    for messages in itertools.permutations(sample_messages(types, load)):
+        trial, = sample_trials(messages)
+        goal, = trial.goals
+        assert (len(trial.initial), [hand.grips for hand in trial.hands]) == (11, [(0,)])
+        assert goal.stable and goal.held_by == ()
+
+
+def test_yaml_messages_show_the_first_trial_of_object1(types):
+    whole = read_session(SAMPLES / 'object1').messages[:len(INPUT_TYPES)]
+    for (kind, message), (expected_kind, expected) in zip(sample_messages(types), whole, strict=True):
+        one, other = read(kind, message), read(expected_kind, expected)
+        assert (one.kind, one.stamp, one.frame_id) == (other.kind, other.stamp, other.frame_id)
+        if kind == ACTION:
+            np.testing.assert_array_equal(one.times, other.times)
+            found, wanted = one.positions, other.positions
+        else:
+            np.testing.assert_array_equal(one.chain.hands, other.chain.hands[::2])
+            found, wanted = one.chain.points, other.chain.points[::2]
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=0.501e-4)
+
+
+def test_yaml_messages_calibrate(types):
+    simulator = BulletSimulator()
+    result = calibrate(sample_trials(sample_messages(types)), ParameterSpace(mass=0.03), simulator,
+                       RandomSearch(4, seed=1), budget=2)
+    simulator.close()
+    assert len(result.evaluations) == 2
+    assert result.best.score < 100
+
+
+@pytest.mark.parametrize('kind', INPUT_TYPES)
+def test_yaml_file_begins_with_its_command_which_the_readme_has(kind):
+    command = ' '.join(line.lstrip('# ').rstrip('\\ ') for line in
+                       message_file(kind).read_text(encoding='utf-8').split('\n')[:2])
+    assert command == f'ros2 topic pub --once /calibrator/{kind} {INPUT_TYPES[kind]} ' \
+        f'"$(cat msg_samples/{kind}.yaml)"'
+    assert f'    {command}\n' in (SAMPLES / 'README.md').read_text(encoding='utf-8')
+
+
+def test_script_writes_the_yaml_files(tmp_path):
+    spec = spec_from_file_location('make_yaml', SAMPLES / 'make_yaml.py')
+    script = module_from_spec(spec)
+    spec.loader.exec_module(script)
+    assert script.main([str(SAMPLES / 'object1'), str(tmp_path)]) == 0
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {
+        f'{kind}.yaml': message_file(kind).read_text() for kind in INPUT_TYPES}
+
+
+@pytest.mark.parametrize('folder', SESSIONS, ids=lambda folder: folder.name)
+def test_session_is_complete(folder, capsys):
+    assert cli.main(['info', str(folder), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert len(found['trials']) == 4
+    assert found['messages'] == {f'/calibrator/{kind}': 4 for kind in INPUT_TYPES}
+    assert (found['problems'], found['refusals']) == ([], [])

@@ -1,0 +1,269 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+
+"""Input that is wrong, at both doors: topics of a live node, and files; then input mutated at random."""
+
+from contextlib import contextmanager
+import functools
+import itertools
+from types import SimpleNamespace
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+from live import live_node, LOG_WARN, QUICK
+import pytest
+from test_collector import contents
+from toy_messages import SECOND, session_messages, write_session
+from toy_simulator import ToySimulator
+from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRONG
+
+from dlo_calibration import InputError
+from dlo_calibration.collector import TrialCollector
+from dlo_calibration.config import Options
+from dlo_calibration.messages import bag_types, INPUT_TYPES, read
+from dlo_calibration.recording import SessionWriter
+from dlo_calibration.session import decode, encode, read_session, Record, session_trials
+from dlo_calibration.worker import calibrate_with
+
+FILES = bag_types()
+GOOD = session_messages(FILES, 2)
+
+
+# ---- the doors
+
+
+class Topics:
+    """The topics and services of a live node with two good trials; one for the whole module."""
+
+    def __init__(self, robot, node_module):
+        self.robot = robot
+        self.module = node_module
+        self.types = node_module.TYPES
+        self.robot.send(session_messages(self.types, 2))
+        self.robot.until_status(trials='2')
+        self.score = self.calibrated()
+
+    def calibrated(self):
+        """Calibrate the trials that there are; return the best score."""
+        results = self.robot.heard['result']
+        count = len(results)
+        answer = self.robot.call('start')
+        assert answer.success, answer.message
+        self.robot.until(lambda: len(results) > count, 'no result')
+        self.robot.until_status(state='done')
+        return self.module.whole(results[-1])['score']
+
+    @contextmanager
+    def refusing(self):
+        """Give an object whose `text` is the one refusal of what happens meanwhile, in status and log."""
+        mark = len(self.robot.heard['status']), len(self.robot.heard['log'])
+        trials = self.robot.status['trials']
+        caught = SimpleNamespace(text=None)
+        yield caught
+
+        def texts():
+            statuses = self.robot.heard['status'][mark[0]:]
+            said = (self.module.values(message.status[0])['last_refusal'] for message in statuses)
+            return [text for text, _ in itertools.groupby(said)]
+
+        def warnings():
+            return [log.msg for log in self.robot.heard['log'][mark[1]:] if log.level >= LOG_WARN]
+
+        self.robot.until(warnings, 'no refusal')
+        self.robot.until(lambda: texts() and texts()[-1] == warnings()[-1], 'no refusal in status')
+        assert self.robot.status['trials'] == trials == '2'
+        assert self.calibrated() == self.score
+        self.robot.until(lambda: any(log.msg.startswith('calibrated') for log in
+                                     self.robot.heard['log'][mark[1]:]))
+        caught.text, = warnings()  # one for all that happened, the calibration too
+        assert self.robot.status['last_refusal'] == caught.text
+
+
+@pytest.fixture(scope='module')
+def topics(shared_ros_environment, tmp_path_factory):
+    import test_node
+
+    with live_node(shared_ros_environment, tmp_path_factory.mktemp('node')) as robot:
+        yield Topics(robot, test_node)
+
+
+@functools.cache
+def good_score():
+    """Return the best score that the good trials have in a file."""
+    collector = TrialCollector(Options())
+    for kind, message in GOOD:
+        collector.add(read(kind, message))
+    return score_of(collector.trials)
+
+
+def score_of(trials):
+    return calibrate_with(trials, Options.of(QUICK), lambda _: ToySimulator()).best.score
+
+
+# ---- messages
+
+
+@pytest.mark.parametrize('case', WRONG, ids=lambda case: case.name)
+def test_wrong_message_on_a_topic_is_refused_once_and_the_trials_calibrate(topics, case):
+    with topics.refusing() as refusal:
+        topics.robot.send([(case.kind, made(case, topics.types))])
+    for word in case.words():
+        assert word in refusal.text
+
+
+@pytest.mark.parametrize('case', WRONG, ids=lambda case: case.name)
+def test_wrong_message_in_a_file_is_refused_once_and_the_trials_calibrate(tmp_path, command, case):
+    path = write_session(tmp_path / 'session', [*GOOD, (case.kind, made(case, FILES))], QUICK)
+    session = read_session(path)
+    trials, (refusal,) = session_trials(session, Options())
+    assert (len(trials), session.problems) == (2, ())
+    for word in case.words():
+        assert word in refusal
+    code, result, errors = command('fit', path, '--json')
+    assert (code, result['score'], errors) == (0, good_score(), [refusal])
+    code, about, errors = command('info', path, '--json')
+    assert (code, about['refusals'], len(about['trials']), errors) == (0, [refusal], 2, [])
+
+
+def test_live_and_replayed_refusals_are_the_same(topics, tmp_path):
+    case = next(case for case in WRONG if case.name == 'fewer points')
+    with topics.refusing() as live:
+        topics.robot.send([(case.kind, made(case, topics.types))])
+    path = write_session(tmp_path / 'session', [*GOOD, (case.kind, made(case, FILES))])
+    assert session_trials(read_session(path), Options())[1] == (live.text,)
+
+
+# ---- parameters
+
+PARAMETERS = [
+    ('mass', -1.0, 'parameter mass: got -1 kg, expected 0 to 1000 kg; choose a value in that range'),
+    ('evaluations', 0, 'parameter evaluations: got 0, expected 1 to 1e+06; choose a value in that range'),
+    ('friction', 100.5, 'parameter friction: got 100.5, expected 0 to 100; choose a value in that range'),
+    ('mass', 'heavy', "parameter mass: got 'heavy', expected a number; give it that type"),
+    ('search', 'magic', "parameter search: got 'magic', expected one of "),
+    ('calibrate', ['colour'], "parameter calibrate: got 'colour', expected one of flexibility"),
+    ('masss', 1.0, "parameter: got 'masss', expected one of mass, table, "),
+]
+
+
+@pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
+def test_wrong_parameter_is_refused_once_by_the_live_node(topics, name, value, text):
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    client = topics.robot.node.create_client(SetParameters, '/calibrator/set_parameters')
+    topics.robot.until(client.service_is_ready)
+    before = topics.robot.calibrator.options()
+    with topics.refusing() as refusal:
+        future = client.call_async(SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()]))
+        topics.robot.until(future.done)
+    answer, = future.result().results
+    assert (answer.successful, answer.reason) == (False, refusal.text)
+    assert refusal.text.startswith(text)
+    assert topics.robot.calibrator.options() == before
+    topics.robot.node.destroy_client(client)
+
+
+@pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
+def test_wrong_parameter_is_refused_once_by_the_command_line(tmp_path, command, name, value, text):
+    path = write_session(tmp_path / 'session', GOOD, QUICK)
+    words = value if isinstance(value, list) else [value]
+    code, output, (error,) = command('fit', path, '--json', f'--{name}', *words)
+    assert (code, output) == (2, None)
+    if name == 'masss' or value == 'heavy':  # argparse knows
+        assert f'--{name}' in error or '--mass' in error
+        assert error.endswith('see dlo-calibration fit --help') or error.endswith('--help')
+    else:
+        assert text in error
+
+
+@pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
+def test_wrong_parameter_recorded_in_a_file_is_left_out_and_told_once(tmp_path, command, name, value, text):
+    path = write_session(tmp_path / 'session', GOOD, {**QUICK, name: value})
+    if name in QUICK:
+        path = write_session(tmp_path / 'session', GOOD, {'workers': 1, 'seed': 1, name: value})
+    code, result, errors = command('fit', path, '--json', '--evaluations', 4)
+    problem, = errors
+    assert f'left out: {text}' in problem
+    assert (code, result['score']) == (0, good_score())
+
+
+# ---- mutations
+
+
+def collected(messages):
+    """Collect messages after the good ones; a refusal must leave the trials as they are."""
+    collector = TrialCollector(Options())
+    for kind, message in GOOD:
+        collector.add(read(kind, message))
+    for kind, make in messages:
+        before = contents(collector.trials)
+        try:
+            collector.add(read(kind, make()))
+        except InputError as error:
+            assert all((error.thing, error.came, error.expected, error.remedy))
+            assert contents(collector.trials) == before
+        collector.take_news()
+        str(collector.problems), str(collector.loose_end), str(collector.incomplete)
+    return collector
+
+
+@settings(max_examples=150, deadline=None)
+@given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
+def test_mutated_bytes_are_collected_or_refused(messages):
+    collector = collected([
+        (kind, functools.partial(decode, Record(f'/{kind}', INPUT_TYPES[kind], octets, LATE)))
+        for kind, octets in messages])
+    if collector.trials:
+        score_of(collector.trials)
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_mutated_fields_are_collected_or_refused(data):
+    originals = fuzzed_pairs(FILES, 'world')
+    which = data.draw(st.lists(st.integers(0, len(originals) - 1), min_size=1, max_size=6))
+    messages = [(originals[k][0], data.draw(mutated_fields(lambda k=k: fuzzed_pairs(FILES, 'world')[k][1])))
+                for k in which]
+    collector = collected([(kind, lambda message=message: message) for kind, message in messages])
+    if collector.trials:
+        score_of(collector.trials)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(messages=st.lists(mutations('camera'), min_size=1, max_size=12))
+def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
+    for kind, octets in messages:
+        topics.robot.publishers[kind].publish(octets)
+    assert topics.calibrated() == topics.score
+    assert topics.robot.status['trials'] == '2'
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(messages=st.lists(mutations('world'), min_size=1, max_size=6), good_last=st.booleans())
+def test_mutated_bytes_in_a_file_end_in_a_result_or_one_line(tmp_path_factory, command, messages, good_last):
+    path = tmp_path_factory.mktemp('mutated') / 'session.mcap'
+    good = [(kind, encode(message, INPUT_TYPES[kind])) for kind, message in GOOD]
+    with SessionWriter(path, QUICK) as writer:
+        for k, (kind, octets) in enumerate([*messages, *good] if good_last else [*good, *messages]):
+            writer.write(f'/calibrator/{kind}', INPUT_TYPES[kind], octets, (k + 1) * SECOND, flush=False)
+    code, about, errors = command('info', path, '--json')
+    assert (code, errors) == (0, [])
+    code, result, errors = command('fit', path, '--json')
+    assert code == (0 if about['trials'] else 2)
+    assert (result is None) == (code == 2)
+    assert [line for line in errors if 'Traceback' in line] == []
