@@ -26,18 +26,15 @@ from collections import deque
 import functools
 import sys
 import time
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -51,13 +48,14 @@ from visualization_msgs.msg import MarkerArray
 from dlo_calibration import diagnostics, messages
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.collector import KEPT, TrialCollector
-from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.config import Options
 from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.options_node import OptionsNode
 from dlo_calibration.recorder import Recorder
 from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
 
@@ -77,7 +75,6 @@ OUTPUTS = {
     'status': (DiagnosticArray, LATCHED),
     'markers': (MarkerArray, LATCHED),
 }
-ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')  # declared by rclpy
 
 #: What a bad command line raises; nothing public has them.
 ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
@@ -90,8 +87,6 @@ QUIET = 0.5  # s without action or goal chain, until a last trial counts as comp
 WAIT = 'wait for it, or call ~/stop first'
 DEFECT = 'this is a defect of dlo_calibration, please report it'
 PATIENCE = 10.0  # s that the end waits for the worker
-
-DECLARED: Mapping[str, Declaration] = {declaration.name: declaration for declaration in declarations()}
 
 
 def spin(args: Sequence[str], should_stop: Callable[[], bool],
@@ -130,7 +125,7 @@ def spin(args: Sequence[str], should_stop: Callable[[], bool],
     return 0
 
 
-class CalibratorNode(Node):
+class CalibratorNode(OptionsNode):
     """
     The node `calibrator`.
 
@@ -140,12 +135,7 @@ class CalibratorNode(Node):
     """
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
-        super().__init__('calibrator', automatically_declare_parameters_from_overrides=True, **arguments)
-        try:
-            self._declare()
-        except BaseException:
-            self.destroy_node()
-            raise
+        super().__init__('calibrator', **arguments)
         self._types = messages.rclpy_types()
         self._collector = TrialCollector(self.options())
         self._collected_with = self.options()
@@ -184,43 +174,17 @@ class CalibratorNode(Node):
             self._recorder.end()
             self.destroy_node()
 
-    # Parameters
+    def changed(self, names: Sequence[str]) -> None:
+        """Take note that parameters have new values."""
+        if self._calibrating is not None:
+            self.get_logger().info(f'{", ".join(names)}: takes effect at the next start')
 
-    def options(self) -> Options:
-        """Return the options in force."""
-        return Options.of({name: _plain(self.get_parameter(name).value) for name in DECLARED})
-
-    def _declare(self) -> None:
-        """Declare the parameters; what the user gave was declared by rclpy already, as it came."""
-        given = {name: _plain(one.value) for name, one in self.get_parameters_by_prefix('').items()
-                 if not name.startswith(ROS_PARAMETERS)}
-        chosen = _checked(given)
-        for name in given:
-            self.undeclare_parameter(name)
-        for name, value in chosen.flat().items():
-            self.declare_parameter(name, value, _descriptor(DECLARED[name]), ignore_override=True)
-        self.add_pre_set_parameters_callback(_as_declared)
-        self.add_on_set_parameters_callback(self._check_parameters)
-
-    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters together, as `rclpy.node.Node` does; what is refused is told as a message is."""
-        try:
-            _checked({**self.options().flat(), **{
-                p.name: _plain(p.value) for p in parameter_list if not p.name.startswith(ROS_PARAMETERS)}})
-        except InputError as error:
-            self._refuse(str(error))
-            return SetParametersResult(successful=False, reason=str(error))
-        return super().set_parameters_atomically(parameter_list)
-
-    def _check_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        changed = {p.name: _plain(p.value) for p in parameters if p.name in DECLARED}
-        try:
-            _checked({**self.options().flat(), **changed})
-        except InputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        if changed and self._calibrating is not None:
-            self.get_logger().info(f'{", ".join(changed)}: takes effect at the next start')
-        return SetParametersResult(successful=True)
+    def refuse(self, text: str) -> None:
+        """Tell why something was refused, in the log and in ``~/status``."""
+        self._last_refusal = text
+        self._told.append(text)
+        self._warn(text)
+        self._report()
 
     # Messages in
 
@@ -266,20 +230,14 @@ class CalibratorNode(Node):
                                  'check what publishes it') from error
             self._collector.add(messages.read(kind, message))
             for refusal in self._collector.take_news():
-                self._refuse(str(refusal))
+                self.refuse(str(refusal))
         except InputError as error:
-            self._refuse(str(error))
+            self.refuse(str(error))
         except Exception as error:  # a defect of ours must not take the session with it
-            self._refuse(f'{kind}: could not be used ({error!r}); {DEFECT}')
+            self.refuse(f'{kind}: could not be used ({error!r}); {DEFECT}')
         else:
             if self._calibrating is None:
                 self._state, self._detail = 'collecting', ''
-
-    def _refuse(self, text: str) -> None:
-        self._last_refusal = text
-        self._told.append(text)
-        self._warn(text)
-        self._report()
 
     # Services
 
@@ -294,7 +252,7 @@ class CalibratorNode(Node):
         if response.success:
             self._report()
         else:
-            self._refuse(response.message)
+            self.refuse(response.message)
         return response
 
     def _start(self) -> str:
@@ -309,7 +267,7 @@ class CalibratorNode(Node):
         told = set(self._told)
         for problem in self._collector.problems:
             if str(problem) not in told:
-                self._refuse(str(problem))
+                self.refuse(str(problem))
         trials = self._collector.trials
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
@@ -463,38 +421,3 @@ class CalibratorNode(Node):
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
-
-
-def _checked(flat: Mapping[str, Any]) -> Options:
-    """Return options, or refuse them, also for what only several together show."""
-    options = Options.of(flat)
-    options.space  # noqa: B018
-    return options
-
-
-def _plain(value: Any) -> Any:
-    """Return a parameter's value as options take it."""
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
-
-
-def _as_declared(parameters: list[Parameter]) -> list[Parameter]:
-    """Let an integer be set where a number is declared, as `ros2 param set` sends it."""
-    return [Parameter(p.name, Parameter.Type.DOUBLE, float(p.value))
-            if p.type_ == Parameter.Type.INTEGER and p.name in DECLARED
-            and isinstance(DECLARED[p.name].default, float) else p for p in parameters]
-
-
-def _descriptor(declaration: Declaration) -> ParameterDescriptor:
-    """Return what ROS tools show of an option."""
-    unit = f' [{declaration.unit}]' if declaration.unit else ''
-    descriptor = ParameterDescriptor(description=declaration.description + unit)
-    if declaration.choices:
-        descriptor.additional_constraints = f'one of {", ".join(declaration.choices)}'
-    if declaration.minimum is not None and declaration.maximum is not None:
-        low, high = declaration.minimum, declaration.maximum
-        if isinstance(declaration.default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(low), to_value=float(high))]
-        else:
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
-    return descriptor

@@ -35,13 +35,15 @@ ORDER = (
     # engines
     'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',
     # edges
-    'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder', 'node',
+    'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
+    'options_node', 'node',
     'calibrator', 'cli', '__main__', 'demo',
 )
 
 #: The only modules that may import something, be it at the top or inside a function.
 ONLY = {
-    'rclpy': {'node', 'demo'},  # the demo stands for the robot, on the other side of the graph
+    # the demo stands for the robot, on the other side of the graph
+    'rclpy': {'options_node', 'node', 'demo'},
     'pybullet': {'bullet'},
     'lxml': {'xml'},
     'dlo_calibration.bullet': {'engines'},
