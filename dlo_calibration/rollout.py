@@ -98,6 +98,7 @@ class _Course:
         self._settling = settling
         self._time = 0.0  # of the trial
         self._steps = 0
+        self._rests = False  # nothing has happened since the DLO came to rest
         self._last = stepper.points, 0.0  # the points one step ago, and when that was
         self._ahead = trial.goals  # the goal under way and those after it
         self._grips: dict[str, _Grip] = {}
@@ -201,6 +202,7 @@ class _Course:
         self._hold()
 
     def _hold(self) -> None:
+        self._rests = False
         self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
 
     def _advance(self, count: int) -> None:
@@ -209,9 +211,12 @@ class _Course:
         self._stepper.advance(np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3)))
         self._time += count * self._stepper.time_step
         self._steps += count
+        self._rests = False
 
     def _settle(self, limit: float) -> bool:
-        """Go on until all points moved less than a distance within a time."""
+        """Go on until all points moved less than a distance within a time; at once where it rests."""
+        if self._rests:
+            return True
         step = self._stepper.time_step
         window = max(CHECKS, round(self._settling.time / step))
         left = round(limit / step)
@@ -222,6 +227,7 @@ class _Course:
                 self._advance(int(part))
                 moved = max(moved, float(np.linalg.norm(self._stepper.points - start, axis=1).max()))
             if moved < self._settling.distance:
+                self._rests = True
                 return True
             left -= window
         if left:

@@ -145,6 +145,15 @@ def test_a_stable_goal_waits_until_all_is_at_rest(goal):
     assert rollout.duration == pytest.approx(rollout.steps * STEP)
 
 
+def test_a_stream_of_stable_goals_waits_once():
+    one = rolled([hand(2, 0.0, 1.0)], [resting(1.5)], until=3.0)
+    many = rolled([hand(2, 0.0, 1.0)], [resting(1.5 + k / 30) for k in range(20)], until=3.0)
+    assert many.steps == one.steps
+    assert all(many.settled)
+    for chain in many.chains:
+        assert chain == pytest.approx(one.chains[0], abs=0)
+
+
 def test_times_in_which_nothing_happens_are_skipped():
     late = hand(4, 300.0, 301.0, (0, 0.2, 0))
     rollout = rolled([late], [resting(900.0)], until=1.0)
