@@ -23,10 +23,22 @@ from dlo_calibration.config import Options
 from dlo_calibration.session import read_session, session_trials
 
 SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
+RESULTS = Path(__file__).resolve().parent / 'results' / 'speed.md'
+
+
+@pytest.fixture(scope='module')
+def rows():
+    """Collect the rows of a table, and write it to results/speed.md."""
+    found = []
+    yield found
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text('# speed\n\n`make bench`: object 1, four trials, one core\n\n'
+                       '| nodes | settled rounds per second | microseconds per step |\n|---|---|---|\n'
+                       + '\n'.join(found) + '\n')
 
 
 @pytest.mark.parametrize('nodes', [30, 60, 120])
-def test_settled_rounds(benchmark, nodes):
+def test_settled_rounds(benchmark, nodes, rows):
     """A round: one trial of object 1 simulated until it has settled; the four trials in turn."""
     session = read_session(SAMPLES / 'object1')
     options = Options.of(session.options)
@@ -38,6 +50,6 @@ def test_settled_rounds(benchmark, nodes):
     seconds = benchmark.stats.stats.median
     benchmark.extra_info['rounds per second'] = round(len(trials) / seconds, 1)
     benchmark.extra_info['microseconds per step'] = round(1e6 * seconds / steps, 1)
-    print(f'\n{nodes} nodes: {len(trials) / seconds:.1f} settled rounds/s, '
-          f'{1e6 * seconds / steps:.0f} us/step')
+    rows.append(f'| {nodes} | {len(trials) / seconds:.1f} | {1e6 * seconds / steps:.0f} |')
+    print(f'\n{rows[-1]}')
     simulator.close()
