@@ -34,7 +34,7 @@ from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.request import read_request, request_trials
-from dlo_calibration.session import read_session, Session, session_trials
+from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.trial import Trial
 from dlo_calibration.worker import calibrate_with, SimulatorFactory
@@ -182,9 +182,9 @@ def _is_request(path: Path) -> bool:
     return path.suffix.lower() == '.xml'
 
 
-def _copy_name(source: Path) -> str:
-    """Name the file that `fit` writes its input to."""
-    return REQUEST if _is_request(source) else SESSION
+def _files(source: Path) -> tuple[str, ...]:
+    """Name the files that `fit` writes."""
+    return RESULT, *((REQUEST,) if _is_request(source) else ()), SESSION, REPORT, EVALUATIONS
 
 
 def _shown(value: Any) -> str:
@@ -212,7 +212,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if folder is None and 'output_directory' in _given(chosen):
         folder = Path(found.options.output_directory)
     if folder is not None:
-        _make_folder(folder, _copy_name(chosen.session))
+        _make_folder(folder, _files(chosen.session))
     with StopFlag() as stop:
         with SearchBar(found.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
             try:
@@ -224,7 +224,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         try:
             if folder is not None:
                 _write(folder, chosen.session, found, result)
-                _note(f'{RESULT}, {_copy_name(chosen.session)}, {REPORT} and {EVALUATIONS} are in {folder}')
+                _note(f'{", ".join(_files(chosen.session))} are in {folder}')
         finally:  # a disk that is full by now must not lose what was found
             _print_result(result, chosen.json)
     return 0
@@ -335,10 +335,10 @@ def _print_result(result: CalibrationResult, as_json: bool) -> None:
     terminal.print_result(result, found['parameters'], sys.stdout)
 
 
-def _make_folder(folder: Path, copy: str) -> None:
+def _make_folder(folder: Path, names: Sequence[str]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (RESULT, copy, REPORT, EVALUATIONS):
+        for name in names:
             with (folder / name).open('ab'):
                 pass
     except OSError as error:
@@ -351,12 +351,13 @@ def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult)
     from dlo_calibration.report import write_evaluations, write_report
 
     write_result(folder / RESULT, result, found.options.flat())
-    copy = _copy_name(source)
-    _write_session(folder / copy, source, found)
+    _write_session(folder / SESSION, source, found)
+    if _is_request(source):
+        _copy(source, folder / REQUEST)
     write_evaluations(folder / EVALUATIONS, result)
     flags = [flag for name, value in found.options.flat().items() if value != Options().flat()[name]
              for flag in _as_flags(name, value)]
-    command = ' '.join([PROGRAM, 'fit', copy, *flags])
+    command = ' '.join([PROGRAM, 'fit', REQUEST if _is_request(source) else SESSION, *flags])
     write_report(folder / REPORT, result, command, [*found.session.problems, *found.refusals])
 
 
@@ -368,22 +369,33 @@ def _as_flags(name: str, value: Any) -> list[str]:
 
 
 def _write_session(path: Path, source: Path, found: _Input) -> None:
-    """Copy a session into one MCAP file; one that is already such a file, or a request, byte by byte."""
+    """
+    Copy a session into one MCAP file; one that is already such a file, byte by byte.
+
+    Of a request, the messages are written that a robot would have sent.
+    """
     files = [source] if source.is_file() else sorted(source.glob('*.mcap'))
     try:
-        if len(files) == 1 and (files[0].suffix == '.mcap' or _is_request(source)):
-            if not (path.exists() and path.samefile(files[0])):
-                shutil.copyfile(files[0], path)
+        if len(files) == 1 and files[0].suffix == '.mcap':
+            _copy(files[0], path)
             return
-        writer = SessionWriter(path.with_name(f'{path.name}.new'), found.session.options)
+        records, options = found.session.records, found.session.options
+        if _is_request(source):
+            records, options = trial_records(found.trials), found.options.flat()
+        writer = SessionWriter(path.with_name(f'{path.name}.new'), options)
         with writer:
-            for record in found.session.records:
+            for record in records:
                 writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
         writer.file.replace(path)
         shutil.rmtree(writer.path)
     except OSError as error:
         raise InputError(f'file {path}', str(error), 'a place that can be written to',
                          'choose another one with --output') from error
+
+
+def _copy(source: Path, target: Path) -> None:
+    if not (target.exists() and target.samefile(source)):
+        shutil.copyfile(source, target)
 
 
 def _info(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:

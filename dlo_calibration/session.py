@@ -35,7 +35,14 @@ from ruamel.yaml import YAML
 from dlo_calibration.collector import TrialCollector
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import INPUT_TYPES, read
+from dlo_calibration.messages import (
+    action_trajectory,
+    ActionMessage,
+    bag_types,
+    chain_cloud,
+    INPUT_TYPES,
+    read,
+)
 from dlo_calibration.recording import (
     METADATA_FILE,
     METADATA_KEY,
@@ -45,6 +52,7 @@ from dlo_calibration.recording import (
     typestore,
 )
 from dlo_calibration.trial import Trial
+from dlo_calibration.trial_messages import trial_messages
 
 __all__ = ['Record', 'RecordingError', 'Session', 'SessionWriter', 'decode', 'encode', 'read_session',
            'session_trials']
@@ -122,6 +130,17 @@ class Session:
         :raises InputError: for one that does not decode.
         """
         return tuple(decode(record) for record in self.records if record.name == name)
+
+
+def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Record, ...]:
+    """Return the records of a session in which a robot does given trials; see `trial_messages`."""
+    types, records = bag_types(), []
+    for message in trial_messages(tuple(trials), frame_id):
+        built = action_trajectory(types, message) if isinstance(message, ActionMessage) else \
+            chain_cloud(types, message.chain, message.stamp, message.frame_id)
+        name = INPUT_TYPES[message.kind]
+        records.append(Record(f'/calibrator/{message.kind}', name, encode(built, name), message.stamp))
+    return tuple(records)
 
 
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:

@@ -30,7 +30,8 @@ ORDER = (
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score', 'search',
     'uncertainty', 'calibration', '__init__', 'config', 'parameter_file',
     # messages and files
-    'messages', 'diagnostics', 'markers', 'segment', 'collector', 'recording', 'xml', 'description',
+    'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
+    'collector', 'recording', 'xml', 'description',
     'request', 'session',
     # engines
     'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',

@@ -328,12 +328,16 @@ def test_fit_of_a_request_writes_its_files_and_validate_takes_it(command, file, 
     assert code == 0
     assert 'evaluations: 5 instead of 20' in errors
     assert {one.name for one in (tmp_path / 'out').iterdir()} == {
-        'result.xml', 'request.xml', 'report.html', 'evaluations.csv'}
+        'result.xml', 'request.xml', 'session.mcap', 'report.html', 'evaluations.csv'}
     assert (tmp_path / 'out' / 'request.xml').read_bytes() == file.read_bytes()
     assert read_result(tmp_path / 'out' / 'result.xml').mass == 0.2
     code, again, _ = command('validate', tmp_path / 'out' / 'result.xml', file, '--json')
     assert code == 0
     assert json.loads(again)['scores'] == json.loads(output)['scores']
+    # what a robot would have sent
+    code, replayed, _ = command('fit', tmp_path / 'out' / 'session.mcap', '--json')
+    assert code == 0
+    assert json.loads(replayed)['score'] == pytest.approx(json.loads(output)['score'], rel=1e-6)
 
 
 def test_info_says_what_is_in_a_request(command, file):

@@ -1,0 +1,120 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Trial messages: the messages that a robot would have sent, had it done given trials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Sequence, Union
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from dlo_calibration.action import Hand
+from dlo_calibration.chain import Chain, Floats
+from dlo_calibration.messages import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
+from dlo_calibration.segment import order
+from dlo_calibration.trial import Goal, Trial
+
+EPOCH = 1_700_000_000 * NANOSECONDS  # of the first trial
+PAUSE = 10 * NANOSECONDS  # between two trials
+BEFORE = NANOSECONDS // 100  # an earlier chain that gives a velocity is that much older
+
+
+def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Union[ChainMessage, ActionMessage]]:
+    """
+    Return messages that a `TrialCollector` makes the same trials of, to a nanosecond.
+
+    A hand that goes on holding during a later action takes part in it, at rest.
+    What the wire cannot say is lost: two hands that grip one point of a chain, and
+    a hand that closes far from where the latest chain before it shows its point.
+    """
+    found: list[Union[ChainMessage, ActionMessage]] = []
+    zero = EPOCH
+    for trial in trials:
+        found += _messages(trial, frame_id, zero)
+        end = max([goal.time for goal in trial.goals] + [hand.end for hand in trial.hands])
+        zero += round(end * NANOSECONDS) + PAUSE
+    return found
+
+
+def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage, ActionMessage]]:
+    def at(time: float) -> int:
+        return zero + round(time * NANOSECONDS)
+
+    groups = _groups(trial)
+    initial = _annotated(trial.initial, groups[0], [hand.name for hand in groups[0]])
+    found: list[Union[ChainMessage, ActionMessage]] = []
+    if trial.velocity is None:
+        found.append(ChainMessage(INITIAL, zero - BEFORE, frame_id, initial))
+    else:
+        earlier = replace(initial, points=initial.points - trial.velocity * (BEFORE / NANOSECONDS))
+        found += [ChainMessage(INITIAL, zero - BEFORE, frame_id, earlier),
+                  ChainMessage(INITIAL, zero, frame_id, initial)]
+    for hands in groups:
+        times = np.unique(np.concatenate([hand.times for hand in hands]))
+        poses = [_poses(hand, times) for hand in hands]
+        found.append(ActionMessage(
+            at(times[0]), frame_id, tuple(hand.name for hand in hands), times - times[0],
+            np.stack([positions for positions, _ in poses], axis=1),
+            np.stack([turns for _, turns in poses], axis=1)))
+    for goal in trial.goals:
+        found.append(ChainMessage(GOAL, at(goal.time), frame_id, _seen(trial, goal, groups)))
+    return sorted(found, key=order)
+
+
+def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
+    """Return the hands that close and open together, in the order of their closing."""
+    groups: dict[tuple[int, float, float], list[Hand]] = {}
+    for k, action in enumerate(trial.actions):
+        for hand in action.hands:
+            groups.setdefault((k, hand.start, hand.end), []).append(hand)
+    found: list[tuple[Hand, ...]] = []
+    for (_, start, end), hands in sorted(groups.items(), key=lambda item: item[0][1]):
+        names = {hand.name for hand in hands}
+        after = [goal for goal in trial.goals if goal.time > end]
+        holding = trial.holding(after[0]) if after else ()
+        found.append((*hands, *(_at_rest(hand, start, end) for hand in holding
+                                if hand.end <= start and hand.name not in names)))
+    return found
+
+
+def _at_rest(hand: Hand, start: float, end: float) -> Hand:
+    """Return a hand that stays where another one has arrived."""
+    times = [start, end] if end > start else [start]
+    return Hand(hand.name, hand.grips, np.array(times), np.repeat(hand.positions[-1:], len(times), axis=0),
+                np.repeat(hand.orientations[-1:], len(times), axis=0))
+
+
+def _seen(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain:
+    latest = [hands for hands in groups if hands[0].start <= goal.time]
+    return _annotated(goal.chain, latest[-1] if latest else (), [hand.name for hand in trial.holding(goal)])
+
+
+def _annotated(chain: Chain, hands: Sequence[Hand], holding: Sequence[str]) -> Chain:
+    """Return the chain with the number of the hand at each gripped point."""
+    numbers = np.zeros(len(chain), np.uint8)
+    for k, hand in enumerate(hands, start=1):
+        if hand.name in holding:
+            numbers[list(hand.grips)] = k
+    return replace(chain, hands=numbers)
+
+
+def _poses(hand: Hand, times: Floats) -> tuple[Floats, Floats]:
+    """Return (k, 3) positions [m] and (k, 4) quaternions of a hand."""
+    if len(hand.times) == len(times):
+        return hand.positions, hand.orientations
+    turns = Rotation.from_quat(hand.orientations)
+    return hand.positions_at(times), np.asarray(Slerp(hand.times, turns)(times).as_quat())

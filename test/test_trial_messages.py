@@ -1,0 +1,85 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Trials as messages: collected again, they are the same trials."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.chain import Chain
+from dlo_calibration.collector import TrialCollector
+from dlo_calibration.config import Options
+from dlo_calibration.request import read_request, request_trials
+from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.trial_messages import trial_messages
+
+SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'
+POINTS = np.stack([np.linspace(0, 0.5, 6), 0.01 * np.arange(6) ** 2, 0.004 + np.zeros(6)], axis=1)
+
+
+def collected(trials):
+    collector = TrialCollector(Options())
+    for message in trial_messages(trials, 'world'):
+        collector.add(message)
+    assert not collector.problems
+    return collector.trials
+
+
+def assert_same(found, trials):
+    assert len(found) == len(trials)
+    for one, other in zip(found, trials, strict=True):
+        np.testing.assert_array_equal(one.initial.points, other.initial.points)
+        assert (one.velocity is None) == (other.velocity is None)
+        if one.velocity is not None:
+            np.testing.assert_allclose(one.velocity, other.velocity, atol=1e-9)
+        begin = one.hands[0].start - other.hands[0].start  # time before the first closing is idle
+        assert len(one.hands) >= len(other.hands)  # a hand that goes on holding may come once more
+        for b in other.hands:
+            a, = (a for a in one.hands if a.name == b.name and abs(a.start - begin - b.start) < 3e-9)
+            assert a.grips == b.grips
+            assert a.end - begin == pytest.approx(b.end, abs=3e-9)
+            np.testing.assert_allclose(a.positions_at(b.times + begin), b.positions, atol=1e-7)
+        for a, b in zip(one.goals, other.goals, strict=True):
+            np.testing.assert_array_equal(a.chain.points, b.chain.points)
+            assert a.time - begin == pytest.approx(b.time, abs=3e-9)
+            assert a.stable == b.stable
+            assert {hand.name for hand in one.holding(a)} == {hand.name for hand in other.holding(b)}
+
+
+@pytest.mark.parametrize('name', ['object1', 'object4', 'object5'])
+def test_trials_of_a_session_are_the_same_again(name):
+    session = read_session(SAMPLES / name)
+    trials, _ = session_trials(session, Options.of(session.options))
+    assert_same(collected(trials), trials)
+
+
+@pytest.mark.parametrize('name', ['named_actions', 'hand_paths', 'push_and_release'])
+def test_trials_of_a_request_are_the_same_again(name):
+    request = read_request(SAMPLES / 'xml' / f'{name}.xml')
+    trials, _ = request_trials(request, Options.of(request.options))
+    assert_same(collected(trials), trials)
+
+
+def test_a_tracked_trial_with_two_hands_of_their_own_times_is_the_same_again():
+    left = Hand('left', (0, 1), [0.0, 0.4, 1.0], [POINTS[0], POINTS[0] + (0, 0, 0.1), POINTS[0]],
+                [[0, 0, 0, 1], [0, 0, 0.6, 0.8], [0, 0, 0, 1]])
+    right = Hand('right', (5,), [0.25, 0.8], [POINTS[5], POINTS[5] + (0, 0.05, 0)])
+    goals = tuple(Goal(Chain(POINTS + (0, 0, 0.01 * t)), t, stable=False) for t in (0.1, 0.5, 1.0))
+    velocity = np.tile((0.1, -0.2, 0.3), (6, 1))
+    trial = Trial('tracked', Chain(POINTS), (Action((left, right)),), goals, velocity)
+    assert_same(collected([trial]), [trial])
