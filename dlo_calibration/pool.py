@@ -72,16 +72,6 @@ class ProcessExecutor(Executor):
             process.join()
 
 
-def process_executor(workers: int) -> ProcessExecutor:
-    """Return an executor of `workers` processes; 0: one per core."""
-    return ProcessExecutor(workers)
-
-
-def close(executor: ProcessExecutor) -> None:
-    """End an executor's processes now, whatever they are doing."""
-    executor.close()
-
-
 def _pass_on(done: Future[Any], future: Future[Any]) -> None:
     """Give `future` what `done` ended with, unless it was cancelled."""
     if not future.set_running_or_notify_cancel():

@@ -25,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.score import SIMILAR, VERY_SIMILAR
 
 WIDTH = 110  # columns where the output is not a terminal
 
@@ -110,7 +111,8 @@ def error_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return how well the simulated chains fit, and how that was found, in words."""
     errors = result.errors
     return [
-        ('difference score', f'{result.best.score:.1f} cm (below 100: similar, below 50: very similar)'),
+        ('difference score', f'{result.best.score:.1f} cm (below {SIMILAR:g}: similar, '
+                             f'below {VERY_SIMILAR:g}: very similar)'),
         ('mean error', f'{errors.mean * 1e3:.2f} mm '
                        f'({100 * errors.mean / result.length:.2f} % of the length)'),
         ('rms / max error', f'{errors.rms * 1e3:.2f} / {errors.max * 1e3:.2f} mm'),

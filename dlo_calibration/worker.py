@@ -67,7 +67,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
     space = options.space
     search = SEARCHES[options.search](space.dimension, options.seed)
     workers = min(options.workers or pool.cores(), options.evaluations)
-    executor = pool.process_executor(workers) if workers > 1 else None
+    executor = pool.ProcessExecutor(workers) if workers > 1 else None
     simulator = make_simulator(options)
     try:
         return calibrate(
@@ -79,7 +79,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
             'try again with fewer workers') from error
     finally:
         if executor is not None:
-            pool.close(executor)
+            executor.close()
         simulator.close()
 
 

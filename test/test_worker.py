@@ -162,7 +162,7 @@ assert __name__ == '__main__', 'the main module was imported by a child'
 sys.modules['heavy'] = sys
 from dlo_calibration import pool
 
-executor = pool.process_executor(2)
+executor = pool.ProcessExecutor(2)
 print(executor.submit(eval, "'heavy' in __import__('sys').modules").result(), flush=True)
 for _ in range(8):
     executor.submit(time.sleep, 600)
@@ -206,23 +206,23 @@ def test_processes_leave_signals_to_their_parent(parent):
 
 
 def test_closing_a_pool_ends_what_is_under_way():
-    executor = pool.process_executor(2)
+    executor = pool.ProcessExecutor(2)
     future = executor.submit(time.sleep, 10 * PATIENCE)
     children = spawned(os.getpid(), 1)
-    pool.close(executor)
+    executor.close()
     assert gone(children)
     with pytest.raises(BaseException):  # noqa: B017 - cancelled or broken, but not waiting for ever
         future.result(timeout=PATIENCE)
 
 
 def test_zero_workers_are_one_per_core():
-    executor = pool.process_executor(0)
+    executor = pool.ProcessExecutor(0)
     try:
         for _ in range(2 * pool.cores()):
             executor.submit(time.sleep, 10 * PATIENCE)
         assert len(spawned(os.getpid(), len(os.sched_getaffinity(0)))) == pool.cores()
     finally:
-        pool.close(executor)
+        executor.close()
 
 
 def test_every_engine_that_can_be_chosen_exists():
