@@ -55,6 +55,7 @@ setup(
         'lxml>=5.2',
         'matplotlib>=3.6',
         'mcap>=1.6',
+        'numba>=0.58',
         'numpy>=1.26',
         'pybullet>=3.2.5',
         'rich>=13.7',

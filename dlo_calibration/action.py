@@ -38,7 +38,7 @@ def quaternion_lengths(orientations: Floats) -> Floats:
     return lengths
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hand:
     """
     One gripper hand: which points it grips, and the path it moves on.

@@ -114,10 +114,7 @@ class BulletRope:
         self._points = np.array(points, dtype=float)
         self._velocities = np.zeros_like(self._points) if velocities is None else np.array(velocities)
         self._support = np.zeros_like(self._points)
-        self._rod = Rod(np.diff(places), RodProperties(
-            bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
-            mass=physical['mass'], drag=physical['damping'],
-            internal_damping=physical['internal_damping']), self.time_step)
+        self._rod = Rod(np.diff(places), RodProperties.of(physical), self.time_step)
         self._contact = SelfContact(places, physical['self_collision'], physical['friction'], self.time_step)
         self._contact.start(self._points)
         for body, mass, point in zip(self.bodies, self._rod.masses, self._points.tolist(), strict=True):

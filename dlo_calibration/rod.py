@@ -35,7 +35,8 @@ negative is left out, so that the matrix stays positive definite.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Sequence
+from functools import lru_cache
+from typing import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,13 @@ class RodProperties:
     drag: float = 0.0
     internal_damping: float = 0.0
 
+    @classmethod
+    def of(cls, physical: Mapping[str, float]) -> RodProperties:
+        """Take them from physical values by parameter name."""
+        return cls(bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
+                   mass=physical['mass'], drag=physical['damping'],
+                   internal_damping=physical['internal_damping'])
+
 
 class Rod:
     """
@@ -81,17 +89,21 @@ class Rod:
 
     def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float) -> None:
         n = len(rest_lengths) + 1
-        self._rest = rest_lengths
+        #: (N - 1,) [m]
+        self.rest_lengths = rest_lengths
         self._step = time_step
-        self._stiffness = (properties.stretching_stiffness / rest_lengths)[:, None]
+        #: (N - 1,) of each stretching spring [N/m]
+        self.stiffness = properties.stretching_stiffness / rest_lengths
         weights = np.zeros(n)
         weights[:-1] += rest_lengths / 2
         weights[1:] += rest_lengths / 2
         #: (N,) mass of each node [kg]
         self.masses = properties.mass * weights / weights.sum()
-        self._properties = properties
-        self._implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
-        self._places, self._signs = _stretching_places(n)
+        #: [1/s]
+        self.drag = properties.drag
+        self._bending_stiffness = properties.bending_stiffness
+        #: c of the step [s^2], see the module
+        self.implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
         self.hold(())
 
     def hold(self, nodes: Sequence[int]) -> None:
@@ -103,13 +115,12 @@ class Rod:
         """
         self._held = np.array(sorted(nodes), int)
         self._pull = HELD * self.masses[self._held]
-        held = np.isin(np.arange(len(self.masses)), self._held)
+        held = np.zeros(len(self.masses), bool)
+        held[self._held] = True
         rigid = held[:-1] & held[1:]
-        self._bending = _bending_bands(self._rest, rigid, self._properties.bending_stiffness)
-        self._constant = np.zeros((BANDS, len(self.masses), 3))
-        self._constant[0] = (self.masses * (1 + self._properties.drag * self._step))[:, None]
-        for offset in range(3):
-            self._constant[3 * offset] += self._implicit * self._bending[offset][:, None]
+        #: (3, N) bending matrix [N/m]: its diagonal and the two below it
+        self.bending = _bending_bands(self.rest_lengths, rigid, self._bending_stiffness)
+        self._constant: Floats | None = None
 
     @property
     def held(self) -> Indices:
@@ -131,23 +142,26 @@ class Rod:
         segments = points[1:] - points[:-1]
         squares = np.einsum('ij,ij->i', segments, segments)
         lengths = np.sqrt(squares)
-        slack = (1 - self._rest / lengths)[:, None]
-        tensions = self._stiffness * slack * segments
+        slack = (1 - self.rest_lengths / lengths)[:, None]
+        tensions = self.stiffness[:, None] * slack * segments
         forces = -self._bend(points)
         forces[:-1] += tensions
         forces[1:] -= tensions
         right = self.masses[:, None] * (velocities + step * gravity) + step * forces
 
-        across = np.maximum(slack, 0) * self._stiffness
-        along = (self._stiffness - across) / squares[:, None]
+        across = np.maximum(slack, 0) * self.stiffness[:, None]
+        along = (self.stiffness[:, None] - across) / squares[:, None]
         blocks = (along * segments)[:, :, None] * segments[:, None, :]
         blocks[:, (0, 1, 2), (0, 1, 2)] += across
-        blocks *= self._implicit
+        blocks *= self.implicit
         diagonal = np.zeros((len(points), 3, 3))
         diagonal[:-1] = blocks
         diagonal[1:] += blocks
+        if self._constant is None:
+            self._constant = self._constant_bands()
         bands = self._constant.copy()
-        bands.reshape(-1)[self._places] += self._signs * np.concatenate(
+        places, signs = _stretching_places(len(points))
+        bands.reshape(-1)[places] += signs * np.concatenate(
             [diagonal[:, _ROWS, _COLUMNS].ravel(), blocks.ravel()])
         bands[0, self._held] += self._pull[:, None]
         right[self._held] += self._pull[:, None] * held_velocities
@@ -157,9 +171,17 @@ class Rod:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
         return np.asarray(solution).reshape(-1, 3)
 
+    def _constant_bands(self) -> Floats:
+        """Return the part of the matrix that stays the same until other nodes are held, (BANDS, N, 3)."""
+        bands = np.zeros((BANDS, len(self.masses), 3))
+        bands[0] = (self.masses * (1 + self.drag * self._step))[:, None]
+        for offset in range(3):
+            bands[3 * offset] += self.implicit * self.bending[offset][:, None]
+        return bands
+
     def _bend(self, points: Floats) -> Floats:
         """Multiply (N, 3) with the bending matrix."""
-        diagonal, first, second = self._bending
+        diagonal, first, second = self.bending
         product: Floats = diagonal[:, None] * points
         product[:-1] += first[:-1, None] * points[1:]
         product[1:] += first[:-1, None] * points[:-1]
@@ -186,6 +208,7 @@ def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: fl
     return bands
 
 
+@lru_cache(maxsize=4)
 def _stretching_places(n: int) -> tuple[Indices, Floats]:
     """Where stretching blocks go in the flat (BANDS, N, 3) lower bands, and with which sign."""
     def place(row: Indices, column: Indices) -> Indices:

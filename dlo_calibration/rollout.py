@@ -22,14 +22,17 @@ Times in which nothing happens any more are skipped.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import cycle
 import math
-from typing import Protocol
+from typing import Protocol, Sequence
 
 import numpy as np
 
 from dlo_calibration.action import Hand
-from dlo_calibration.chain import Floats
+from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.layout import Layout
 from dlo_calibration.simulator import Rollout
 from dlo_calibration.trial import Goal, Trial
@@ -165,9 +168,9 @@ class _Course:
             nodes = self._layout.nodes(hand)
             step = self._stepper.time_step
             count = max(1, math.ceil((hand.end - self._time) / step - ROUNDING))
-            positions, turns = hand.poses(self._time + step * np.arange(count + 1))
+            positions, turns = _poses(hand, self._time, step, count)
             offsets = self._stepper.points[list(nodes)] - positions[0]
-            path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:] @ turns[0].T, offsets)
+            path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:], offsets)
             self._grips.pop(hand.name, None)
             self._let_go(nodes)
             self._grips[hand.name] = _Grip(hand, nodes, self._steps, path)
@@ -219,17 +222,33 @@ class _Course:
             return True
         step = self._stepper.time_step
         window = max(CHECKS, round(self._settling.time / step))
+        parts = np.diff(np.linspace(0, window, CHECKS + 1).astype(int))
         left = round(limit / step)
-        while left >= window:
-            start = self._stepper.points
-            moved = 0.0
-            for part in np.diff(np.linspace(0, window, CHECKS + 1).astype(int)):
-                self._advance(int(part))
-                moved = max(moved, float(np.linalg.norm(self._stepper.points - start, axis=1).max()))
-            if moved < self._settling.distance:
+        seen: deque[Floats] = deque([self._stepper.points], maxlen=CHECKS + 1)  # over one window
+        for count in cycle(parts):
+            self._advance(int(min(count, left)))
+            left -= int(min(count, left))
+            seen.append(self._stepper.points)
+            if len(seen) > CHECKS and _largest_move(seen) < self._settling.distance:
                 self._rests = True
                 return True
-            left -= window
-        if left:
-            self._advance(left)
+            if left == 0:
+                break
         return False
+
+
+def _largest_move(seen: Sequence[Floats]) -> float:
+    """Return how far any point was from where it first was, at any later time [m]."""
+    start, *later = seen
+    return math.sqrt(max(float(np.square(points - start).sum(axis=1).max()) for points in later))
+
+
+@lru_cache(maxsize=64)
+def _poses(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats]:
+    """
+    Return where a hand is after 0 to `count` steps, (count + 1, 3) [m], and how it has turned since.
+
+    The same for every parameter set, so it is kept.
+    """
+    positions, turns = hand.poses(start + step * np.arange(count + 1))
+    return frozen_array(positions), frozen_array(turns @ turns[0].T)

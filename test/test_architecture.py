@@ -34,7 +34,7 @@ ORDER = (
     'collector', 'recording', 'xml', 'description',
     'request', 'session',
     # engines
-    'layout', 'rollout', 'contact', 'rod', 'bullet', 'engines',
+    'layout', 'rollout', 'contact', 'rod', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
     'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
     'options_node', 'node',
@@ -46,13 +46,15 @@ ONLY = {
     # the demo stands for the robot, on the other side of the graph
     'rclpy': {'options_node', 'node', 'demo'},
     'pybullet': {'bullet'},
+    'numba': {'kernels'},
     'lxml': {'xml'},
     'dlo_calibration.bullet': {'engines'},
+    'dlo_calibration.compiled': {'engines'},
     'dlo_calibration.engines': {'node', 'cli'},
     'dlo_calibration.trial': set(ORDER) - {'search'},
 }
 
-NOT_LOADED = ('rclpy', 'pybullet', 'matplotlib', 'scipy.optimize')
+NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'matplotlib', 'scipy.optimize')
 
 FILES = sorted(FOLDER.rglob('*.py'))
 

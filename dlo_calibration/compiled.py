@@ -1,0 +1,177 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The compiled engine: the rope of `bullet` with a contact of its own, for a table or none.
+
+Same rod, table, friction, self-contact, grips, stable test and time step as the
+PyBullet engine, without a call into another library for each node and step.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Mapping
+
+import numpy as np
+
+from dlo_calibration import kernels
+from dlo_calibration.chain import Floats
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.layout import Layout, rest_on, resting_level
+from dlo_calibration.parameters import GRAVITY
+from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.rollout import roll_out, Settling
+from dlo_calibration.simulator import Rollout
+from dlo_calibration.trial import Trial
+
+NOWHERE = -1e6  # m: where there is no table
+
+
+class CompiledRope:
+    """
+    A rope on a table or in the air, stepped by `kernels`.
+
+    :param nodes: N.
+    :param time_step: [s].
+    """
+
+    def __init__(self, nodes: int, time_step: float) -> None:
+        self.time_step = time_step
+        segments = nodes - 1
+        self._distances = np.empty((segments, segments))
+        self._pairs = np.empty((segments * (segments - 1) // 2, 2), np.int64)
+        self._contacts = np.empty((len(self._pairs), kernels.CONTACT_COLUMNS))
+        self._bands = np.empty((3 * nodes + kernels.BAND - 1, kernels.BAND))
+        self._right = np.empty(3 * nodes + kernels.BAND - 1)
+        self._wanted = np.empty((nodes, 3))
+        self._change = np.empty((nodes, 3))
+
+    def reset(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+              level: float | None) -> None:
+        """
+        Start anew.
+
+        :param places: (N,) [m] of the nodes along the rope at rest.
+        :param points: (N, 3) [m] at the start.
+        :param velocities: (N, 3) [m/s] at the start.
+        :param physical: physical values by parameter name, in SI units.
+        :param level: height [m] of nodes that touch the table; None: no table.
+        """
+        self._points = np.array(points, dtype=float)
+        self._velocities = np.array(velocities, dtype=float)
+        self._support = np.zeros_like(self._points)
+        self._rod = Rod(np.diff(places), RodProperties.of(physical), self.time_step)
+        diameter = 2 * physical['self_collision']
+        half = self._rod.rest_lengths / 2
+        apart = max(np.pi * physical['self_collision'], float(half.max()))
+        kernels.start_distances(self._points, places[:-1] + half, half, apart, diameter, self._pairs,
+                                self._distances)
+        self._constants = np.array([
+            self._rod.drag, self._rod.implicit, self.time_step, GRAVITY,
+            NOWHERE if level is None else level, physical['friction'], diameter, apart, -1.0, 0.0])
+        self._let_go()
+
+    @property
+    def points(self) -> Floats:
+        """The nodes' positions now, (N, 3) [m]; a copy."""
+        return self._points.copy()
+
+    def hold(self, nodes: tuple[int, ...]) -> None:
+        """Let exactly these nodes follow a path from now on."""
+        self._let_go()
+        if nodes:
+            self._held = np.array(nodes, np.int64)
+            self._rod.hold(nodes)
+            self._inverse_masses[self._held] = 0.0
+
+    def _let_go(self) -> None:
+        if len(self._rod.held):
+            self._rod.hold(())
+        self._held = self._rod.held
+        self._inverse_masses = 1 / self._rod.masses
+
+    def advance(self, targets: Floats) -> None:
+        """
+        Take k steps; targets (k, h, 3) [m] of the held nodes after each.
+
+        :raises SimulationError: where the rollout diverges; at that step.
+        """
+        rod = self._rod
+        taken = kernels.advance(
+            np.ascontiguousarray(targets), self._held, self._points, self._velocities, self._support,
+            rod.rest_lengths, rod.stiffness, rod.masses, self._inverse_masses, rod.bending, self._distances,
+            self._pairs, self._contacts, self._bands, self._right, self._wanted, self._change,
+            self._constants)
+        if taken < len(targets):
+            raise SimulationError('the rollout diverged: the chain is no longer finite')
+
+
+class CompiledSimulator:
+    """
+    Simulates trials on a table or in the air, about twenty times as fast as `bullet.BulletSimulator`.
+
+    :param table: whether there is a table.
+    :param table_height: [m].
+    :param nodes: of the rope.
+    :param time_step: [s].
+    :param stable_distance: see `Settling` [m].
+    :param stable_time: see `Settling` [s].
+    :param settle_limit: see `Settling` [s].
+    """
+
+    name = 'compiled'
+
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = 31,
+                 time_step: float = 0.004, stable_distance: float = Settling.distance,
+                 stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
+        self._table_height = table_height if table else None
+        self._nodes = nodes
+        self._time_step = time_step
+        self._settling = Settling(stable_distance, stable_time, settle_limit)
+        self._rope: CompiledRope | None = None
+        self._known: dict[int, tuple[Trial, Layout, float | None]] = {}
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """
+        Simulate a trial with physical parameters by name (SI units).
+
+        :raises SimulationError: where the rollout diverges.
+        :raises InputError: where the trial grips more points than there are nodes.
+        """
+        layout, level = self._layout(trial)
+        points = layout.points
+        if self._table_height is not None:
+            if level is None:
+                level = self._table_height + physical['self_collision']
+            points = rest_on(points, level)
+        if self._rope is None:
+            self._rope = CompiledRope(self._nodes, self._time_step)
+        self._rope.reset(layout.places, points, layout.velocities, physical, level)
+        return roll_out(trial, layout, self._rope, self._settling)
+
+    def _layout(self, trial: Trial) -> tuple[Layout, float | None]:
+        """Return what depends on the trial alone."""
+        if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
+            level = None if self._table_height is None else resting_level(trial, self._table_height)
+            self._known[id(trial)] = trial, Layout.of(trial, self._nodes), level
+        return self._known[id(trial)][1:]
+
+    def close(self) -> None:
+        """Forget the trials."""
+        self._known.clear()
+        self._rope = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the workspace behind: it belongs to this process."""
+        return {**self.__dict__, '_rope': None, '_known': {}}
