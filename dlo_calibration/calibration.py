@@ -30,7 +30,7 @@ from dlo_calibration.score import PointErrors, residuals, TrialScore
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Rollout, Simulator
 from dlo_calibration.trial import Trial
-from dlo_calibration.uncertainty import Spread, spread_of_best
+from dlo_calibration.uncertainty import spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
 
@@ -241,7 +241,7 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
         engine=simulator.name, stop_reason=reason, seed=seed, warnings=_warnings(best, kept))
 
 
-def estimates(space: ParameterSpace, best: Evaluation, spread: Spread) -> dict[str, ParameterEstimate]:
+def estimates(space: ParameterSpace, best: Evaluation, spread: Uncertainty) -> dict[str, ParameterEstimate]:
     """Return the parameters of the best evaluation with their spread, in both units."""
     found = {}
     for k, name in enumerate(space.free):
@@ -250,7 +250,7 @@ def estimates(space: ParameterSpace, best: Evaluation, spread: Spread) -> dict[s
             space.reported(name, x) for x in (value, lower, upper))
         found[name] = ParameterEstimate(
             name, value, float(spread.std[k]) * SCALE, lower, upper, at_value,
-            min(at_lower, at_upper), max(at_lower, at_upper), unit, bool(spread.identifiable[k]))
+            min(at_lower, at_upper), max(at_lower, at_upper), unit, spread.verdicts[k] == 'identifiable')
     return found
 
 

@@ -12,7 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Uncertainty: how far the parameters of the good evaluations lie apart."""
+"""
+Uncertainty: what a calibration does not know, in the unit cube of its parameters.
+
+Where the search ended in a regular minimum, the covariance follows from the
+Jacobian of the residuals there.  Three things are added to what a textbook's
+formula says, because alone it is several times too small for real DLOs:
+
+- neighbouring points err alike, so that they count as fewer;
+- where the model cannot explain the residuals, the trials disagree with each
+  other, and how far says more than how many points there are;
+- the step and the nodes of the simulation move the optimum.
+
+Where it did not, as in a random search, the good evaluations lie apart.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +35,23 @@ from typing import Protocol, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.chain import Floats, frozen_array
 
 BEST_SHARE = 0.05  # of the evaluations count as good,
 BEST_MINIMUM = 8  # but never fewer than that many
 UNKNOWN_STD = 1 / np.sqrt(12)  # of a value anywhere in 0..1
-IDENTIFIABLE_STD = UNKNOWN_STD / 2
+IDENTIFIABLE_STD = UNKNOWN_STD / 4
+WEAK_STD = UNKNOWN_STD / 2
+CONFIDENCE = 0.9  # that the truth lies in an interval
+DEVIATIONS = 1.645  # that half such an interval has, of a normal distribution
+AT_BOUND = 0.002
+MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
+FEWEST_TRIALS = 3  # whose disagreement says something
+INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
+ROBUST = 1.5  # deviations beyond which a residual counts less (Huber, Robust Statistics, 1981, 4.5)
+CAPPED = 0.7785  # mean square of a standard normal value that is cut off there
+
+IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
 
 
 class Scored(Protocol):
@@ -43,21 +67,55 @@ class Scored(Protocol):
 
 
 @dataclass(frozen=True)
-class Spread:
+class Uncertainty:
     """
-    Spread of the good evaluations, all (d,) in the unit cube.
+    What is known of d parameters, in the unit cube.
 
-    `identifiable` is True where they lie closer together than half of what
-    values drawn at random from the whole range would.
+    :param std: (d,) standard deviation.
+    :param lower: (d,) lower end of the 90 % interval; `upper` (d,) its upper end.
+    :param excited: (d,) False where no trial tells anything at all.
+    :param at_bound: (d,) True where the best value is at an end of the scale.
+    :param covariance: (d, d); None where only the spread of evaluations is known.
+    :param residual: standard deviation of one coordinate's residual [m]; nan where not estimated.
     """
 
     std: Floats
     lower: Floats
     upper: Floats
-    identifiable: NDArray[np.bool_]
+    excited: NDArray[np.bool_]
+    at_bound: NDArray[np.bool_]
+    covariance: Floats | None = None
+    residual: float = float('nan')
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """Return one of the three verdicts for each parameter."""
+        return tuple(
+            NOT_IDENTIFIABLE if not excited or std >= WEAK_STD else
+            IDENTIFIABLE if std < IDENTIFIABLE_STD else WEAK
+            for std, excited in zip(self.std, self.excited, strict=True))
+
+    @property
+    def correlations(self) -> Floats | None:
+        """(d, d) correlations of the parameters; None where not known."""
+        if self.covariance is None:
+            return None
+        std = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(std, std))
+
+    @property
+    def undetermined(self) -> tuple[Floats, ...]:
+        """Unit vectors (d,) of combinations of two or more parameters that the trials leave open."""
+        if self.covariance is None:
+            return ()
+        values, vectors = np.linalg.eigh(self.covariance)
+        combined = [vector * np.sign(vector[np.abs(vector).argmax()])
+                    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
+                    if np.sqrt(value) >= IDENTIFIABLE_STD and (np.abs(vector) >= INVOLVED).sum() > 1]
+        return tuple(combined)
 
 
-def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Spread:
+def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     """
     Return how far the parameters of the best evaluations lie apart.
 
@@ -66,13 +124,132 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Spread:
     square distance of the best 5 % (8 at least) from the (d,) point `best`;
     `lower` and `upper` are their extremes.  With too few evaluations to
     choose from, nothing is identifiable.  This measures the search as much as
-    the trials: it says what this calibration knows, not what the data could tell.
+    the trials: it says what this calibration knows, not what the trials could tell.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
     count = max(BEST_MINIMUM, round(BEST_SHARE * len(good)))
+    everywhere = np.ones(len(best), dtype=np.bool_)
     if len(good) < 2 * count:
         unknown = np.ones_like(best)
-        return Spread(unknown * UNKNOWN_STD, unknown * 0, unknown, unknown < 0)
+        return Uncertainty(unknown * UNKNOWN_STD, unknown * 0, unknown, everywhere, ~everywhere)
     points = np.stack([e.point for e in good[:count]])
     std = np.minimum(np.sqrt(np.mean((points - best) ** 2, axis=0)), UNKNOWN_STD)
-    return Spread(std, points.min(axis=0), points.max(axis=0), std < IDENTIFIABLE_STD)
+    return Uncertainty(std, points.min(axis=0), points.max(axis=0), everywhere, ~everywhere)
+
+
+def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], *,
+                  noise: float = float('nan'), shift: Floats | None = None) -> Uncertainty:
+    """
+    Return what the residuals and their derivatives at a minimum say.
+
+    :param point: (d,) in the unit cube.
+    :param residuals: (m,) [m], trial by trial, goal by goal, point by point, coordinate by coordinate.
+    :param jacobian: (m, d) [m per unit cube].
+    :param shapes: (goals, points) of each trial.
+    :param noise: standard deviation of one coordinate of the observations [m]; nan where not known.
+    :param shift: (d,) how far a finer simulation moves the optimum; None: not known.
+    """
+    weights = _weights(residuals)
+    right, matrix = weights * residuals, weights[:, None] * jacobian
+    capped = weights**2 * residuals
+    residual = float(np.sqrt(capped @ capped / CAPPED / max(1, len(residuals) - len(point))))
+    scale = residual * np.sqrt(independence(capped, shapes))
+    prior = np.eye(len(point)) * (scale / UNKNOWN_STD)**2
+    information = matrix.T @ matrix
+    with np.errstate(divide='ignore'):
+        excited = scale / np.sqrt(np.diag(information)) < UNKNOWN_STD
+    covariance = scale**2 * np.linalg.inv(information + prior)
+    extra = np.zeros(len(point))
+    if len(shapes) >= FEWEST_TRIALS and not residual < MODEL_ERROR * noise:
+        disagreement = np.var(left_out(right, matrix, shapes, prior), axis=0) * (len(shapes) - 1)
+        extra = np.maximum(disagreement - np.diag(covariance), 0.0)
+    if shift is not None:
+        extra = extra + shift**2
+    covariance = covariance + np.diag(np.where(excited, extra, 0.0))
+    # None is known worse than a value that may be anything.
+    shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
+    covariance = covariance * np.outer(shrink, shrink)
+    std = np.where(excited, np.sqrt(np.diag(covariance)), UNKNOWN_STD)
+    lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
+    upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
+    at_bound = excited & ((point < AT_BOUND) | (point > 1 - AT_BOUND))
+    return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited, at_bound,
+                       frozen_array(covariance), residual)
+
+
+def left_out(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]],
+             prior: Floats | None = None) -> Floats:
+    """
+    Return (T, d): how far the optimum moves when one trial after the other is left out.
+
+    One Gauss-Newton step from the common optimum (the jackknife of Efron and
+    Tibshirani, An Introduction to the Bootstrap, 1993, 11, linearised).
+
+    :param prior: (d, d) added to the information matrix [m^2 per unit cube squared]; None: a trace of it.
+    """
+    information = jacobian.T @ jacobian
+    if prior is None:
+        prior = np.eye(len(information)) * max(1e-9 * float(np.trace(information)), 1e-30)
+    gradient = jacobian.T @ residuals
+    moved, at = [], 0
+    for goals, points in shapes:
+        rows = slice(at, at + 3 * goals * points)
+        at = rows.stop
+        rest = information - jacobian[rows].T @ jacobian[rows] + prior
+        moved.append(-np.linalg.solve(rest, gradient - jacobian[rows].T @ residuals[rows]))
+    return np.array(moved)
+
+
+def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
+    """
+    Return how many residuals count as one, >= 1: neighbours along the DLO and in time err alike.
+
+    The product of the integrated autocorrelation lengths, 1 + 2 sum rho_k (Priestley,
+    Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial,
+    each summed up to the first that white noise could show.
+    """
+    lengths = []
+    for axis in (1, 0):
+        products: dict[int, list[Floats]] = {}
+        squares, at = [], 0
+        for goals, points in shapes:
+            block = residuals[at:at + 3 * goals * points].reshape(goals, points, 3)
+            at += block.size
+            block = np.moveaxis(block, axis, 0)
+            squares.append(np.square(block).mean())
+            for lag in range(1, len(block) // 2 + 1):
+                products.setdefault(lag, []).append((block[lag:] * block[:-lag]).ravel())
+        power = float(np.mean(squares))
+        length = 1.0
+        for lag in sorted(products):
+            values = np.concatenate(products[lag])
+            correlation = float(values.mean()) / power if power > 0 else 0.0
+            if correlation < 2 / np.sqrt(len(values)):
+                break
+            length += 2 * correlation
+        lengths.append(length)
+    return lengths[0] * lengths[1]
+
+
+def optimum_shift(residuals: Floats, finer: Floats, jacobian: Floats) -> Floats:
+    """
+    Return (d,): how far the optimum moves where a finer simulation gives residuals `finer`, (m,) [m].
+
+    A Gauss-Newton step on the difference, each parameter no further than its whole scale.
+    """
+    information = jacobian.T @ jacobian
+    trace = np.eye(len(information)) * max(1e-6 * float(np.trace(information)), 1e-30)
+    return np.clip(-np.linalg.solve(information + trace, jacobian.T @ (finer - residuals)), -1.0, 1.0)
+
+
+def predictive_std(jacobian: Floats, covariance: Floats) -> Floats:
+    """Return (p,) [m]: how far each of p simulated points may lie elsewhere, given the covariance (d, d)."""
+    variances = np.einsum('mi,ij,mj->m', jacobian, covariance, jacobian)
+    return np.asarray(np.sqrt(variances.reshape(-1, 3).sum(axis=1)))
+
+
+def _weights(residuals: Floats) -> Floats:
+    """Return (m,) square roots of Huber's weights: outliers count less."""
+    scale = 1.4826 * float(np.median(np.abs(residuals)))
+    sizes = np.abs(residuals) / (ROBUST * scale) if scale > 0 else np.zeros_like(residuals)
+    return 1 / np.sqrt(np.maximum(sizes, 1.0))

@@ -19,7 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dlo_calibration.uncertainty import spread_of_best
+from dlo_calibration.uncertainty import (
+    from_jacobian,
+    independence,
+    left_out,
+    optimum_shift,
+    predictive_std,
+    spread_of_best,
+)
 
 TRUTH = np.array([0.4, 0.7])
 
@@ -46,7 +53,8 @@ def spread(evaluations):
 @pytest.mark.parametrize('seed', range(10))
 def test_a_parameter_with_effect_is_identifiable_and_one_without_is_not(seed):
     _, found = spread(tried(150, seed))
-    assert found.identifiable.tolist() == [True, True, False]
+    assert found.verdicts[2] == 'not identifiable'
+    assert 'not identifiable' not in found.verdicts[:2]
     assert (found.std[:2] < 0.15).all()
     assert found.std[2] > found.std[:2].max()
 
@@ -65,7 +73,7 @@ def test_the_bounds_contain_the_best_and_what_made_the_good_ones_good(seed):
 @pytest.mark.parametrize('count', [1, 3, 15])
 def test_from_few_evaluations_nothing_is_identifiable(count):
     _, found = spread(tried(count))
-    assert not found.identifiable.any()
+    assert found.verdicts == ('not identifiable',) * 3
     assert found.lower.tolist() == [0, 0, 0]
     assert found.upper.tolist() == [1, 1, 1]
     assert found.std == pytest.approx(np.full(3, 12**-0.5))  # as of any value between 0 and 1
@@ -76,6 +84,148 @@ def test_failed_evaluations_do_not_count():
     failed = [Tried(np.full(3, 0.99), float('inf'))] * 100
     best, found = spread(good)
     with_failed = spread_of_best(failed + good, best)
-    for name in ('std', 'lower', 'upper', 'identifiable'):
+    for name in ('std', 'lower', 'upper'):
         assert getattr(with_failed, name).tolist() == getattr(found, name).tolist()
-    assert not spread_of_best(failed + good[:5], best).identifiable.any()
+    assert set(spread_of_best(failed + good[:5], best).verdicts) == {'not identifiable'}
+
+
+SHAPES = ((1, 40), (2, 20), (1, 40), (1, 40))
+ROWS = 3 * sum(goals * points for goals, points in SHAPES)
+POINT = np.array([0.4, 0.6, 0.5])
+
+
+def linear_model(seed=0, columns=3):
+    """Return a Jacobian whose columns are smooth along the DLO, as those of real parameters are."""
+    generator = np.random.default_rng(seed)
+    blocks = []
+    for goals, points in SHAPES:
+        along = np.linspace(0, 1, points)[:, None, None]
+        waves = [np.cos(np.pi * k * along) * generator.normal(size=(3, columns)) for k in range(3)]
+        blocks.append(np.tile(sum(waves), (goals, 1, 1)).reshape(-1, columns))
+    return 0.03 * np.concatenate(blocks)
+
+
+def fitted(jacobian, errors):
+    """Return (d,) how far the optimum lies from the truth, and the residuals there, for errors (m,) [m]."""
+    moved = -np.linalg.lstsq(jacobian, errors, rcond=None)[0]
+    return moved, errors + jacobian @ moved
+
+
+def coverage(errors_of, draws=300, **known):
+    """Return the share of draws of the errors whose intervals contain the truth, for each parameter."""
+    jacobian = linear_model()
+    inside = []
+    for draw in range(draws):
+        moved, residuals = fitted(jacobian, errors_of(np.random.default_rng(draw)))
+        found = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, **known)
+        inside.append((found.lower <= POINT) & (POINT <= found.upper))
+    return np.mean(inside, axis=0)
+
+
+def test_nine_of_ten_intervals_contain_the_truth_under_white_noise():
+    share = coverage(lambda generator: generator.normal(0, 1e-3, ROWS), noise=1e-3)
+    assert (share > 0.85).all()
+    assert (share < 0.95).all()
+
+
+def test_errors_that_are_alike_at_neighbours_widen_the_intervals():
+    def smooth(generator):
+        blocks = []
+        for goals, points in SHAPES:
+            for _ in range(goals):
+                rough = generator.normal(0, 1e-3, (points + 4, 3))
+                blocks.append(sum(rough[k:k + points] for k in range(5)).ravel() / np.sqrt(5))
+        return np.concatenate(blocks)
+
+    share = coverage(smooth, noise=1e-3)
+    assert (share > 0.8).all()
+    assert (share < 0.97).all()
+
+
+def test_where_the_model_is_wrong_the_disagreement_of_the_trials_counts():
+    jacobian = linear_model()
+    at = np.cumsum([0, *(3 * goals * points for goals, points in SHAPES)])
+    errors = np.random.default_rng(1).normal(0, 1e-3, ROWS)
+    for k, away in enumerate((0.1, -0.1, 0.1, -0.1)):  # each trial sees another optimum
+        errors[at[k]:at[k + 1]] -= jacobian[at[k]:at[k + 1], 0] * away
+    moved, residuals = fitted(jacobian, errors)
+    noise_alone = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, noise=1.0)
+    found = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, noise=1e-3)
+    assert found.std[0] > 1.5 * noise_alone.std[0]
+    assert found.std[0] > 0.03
+
+
+def test_leaving_a_trial_out_moves_the_optimum_as_a_new_fit_would():
+    jacobian = linear_model()
+    errors = np.random.default_rng(2).normal(0, 1e-3, ROWS)
+    moved, residuals = fitted(jacobian, errors)
+    at = 3 * SHAPES[0][0] * SHAPES[0][1]
+    again, _ = fitted(jacobian[at:], errors[at:])
+    assert left_out(residuals, jacobian, SHAPES)[0] == pytest.approx(again - moved, abs=1e-6)
+
+
+def test_a_parameter_without_effect_is_not_excited_and_can_be_anything():
+    jacobian = linear_model()
+    jacobian[:, 1] = 0.0
+    residuals = np.random.default_rng(3).normal(0, 1e-3, ROWS)
+    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3)
+    assert found.excited.tolist() == [True, False, True]
+    assert found.verdicts == ('identifiable', 'not identifiable', 'identifiable')
+    assert (found.lower[1], found.upper[1]) == (0, 1)
+
+
+def test_two_parameters_that_only_show_together_are_named_as_a_combination():
+    jacobian = linear_model()
+    jacobian[:, 1] = jacobian[:, 0] * (1 + 1e-3 * np.linspace(-1, 1, ROWS))
+    residuals = np.random.default_rng(4).normal(0, 1e-3, ROWS)
+    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3)
+    assert found.verdicts == ('not identifiable', 'not identifiable', 'identifiable')
+    assert found.correlations[0, 1] < -0.95
+    combination, = found.undetermined
+    assert np.abs(combination) == pytest.approx([2**-0.5, 2**-0.5, 0], abs=0.05)
+    assert combination[0] * combination[1] < 0
+
+
+def test_a_value_at_the_end_of_the_scale_is_flagged_and_its_interval_ends_there():
+    residuals = np.random.default_rng(5).normal(0, 1e-3, ROWS)
+    found = from_jacobian(np.array([0.0, 0.6, 1.0]), residuals, linear_model(), SHAPES, noise=1e-3)
+    assert found.at_bound.tolist() == [True, False, True]
+    assert found.lower[0] == 0
+    assert found.upper[2] == 1
+
+
+def test_an_interval_contains_the_optimum_of_a_finer_simulation():
+    jacobian = linear_model()
+    moved, residuals = fitted(jacobian, np.random.default_rng(6).normal(0, 1e-3, ROWS))
+    finer_optimum = np.array([0.1, 0.0, -0.05])
+    finer = residuals - jacobian @ finer_optimum
+    shift = optimum_shift(residuals, finer, jacobian)
+    assert shift == pytest.approx(finer_optimum, abs=1e-4)
+    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3, shift=shift)
+    assert (found.lower <= POINT + finer_optimum).all()
+    assert (POINT + finer_optimum <= found.upper).all()
+    assert found.std[1] < 0.02
+
+
+def test_outliers_hardly_widen_the_intervals():
+    residuals = np.random.default_rng(7).normal(0, 1e-3, ROWS)
+    spoilt = residuals.copy()
+    spoilt[::60] += 0.1
+    clean = from_jacobian(POINT, residuals, linear_model(), SHAPES, noise=1e-3)
+    found = from_jacobian(POINT, spoilt, linear_model(), SHAPES, noise=1e-3)
+    assert (found.std < 3 * clean.std).all()
+
+
+def test_white_residuals_count_each_and_smooth_ones_do_not():
+    generator = np.random.default_rng(8)
+    white = generator.normal(size=3 * 10 * 50)
+    assert independence(white, [(10, 50)]) < 1.3
+    alike = np.repeat(generator.normal(size=(10, 10, 1, 3)), 5, axis=2)  # five neighbours each
+    assert 3 < independence(alike.ravel(), [(10, 50)]) < 8
+    in_time = np.repeat(generator.normal(size=(2, 1, 50, 3)), 5, axis=1)
+    assert independence(in_time.ravel(), [(10, 50)]) > 3
+
+
+def test_the_band_of_a_chain_follows_from_the_covariance():
+    jacobian = np.array([[3.0], [0.0], [4.0], [0.0], [0.0], [0.0]])  # one point moves by 5 m per unit
+    assert predictive_std(jacobian, np.array([[0.01]])) == pytest.approx([0.5, 0.0])

@@ -1,0 +1,199 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Advice: which action, if it were observed next, would tell most about what is not known.
+
+Each candidate is simulated with the found parameters and with values beside
+them.  How far the simulated chains then lie apart, against the error of the
+residuals, is the information that the trial would add (the expected covariance
+of Bayesian experimental design, Chaloner and Verdinelli, Bayesian Experimental
+Design: A Review, 1995, section 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Callable, Iterator, Sequence
+
+import numpy as np
+
+from dlo_calibration.action import Action
+from dlo_calibration.chain import Chain, Floats
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.simulator import Simulator
+from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.uncertainty import DEVIATIONS, Uncertainty
+
+SMALLEST_STEP, LARGEST_STEP = 0.03, 0.25  # in the unit cube: as far as the parameter is unknown, within these
+WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's
+REST = 1.0  # s after which a goal is compared at rest
+WATCHED = 8  # instants at which a moving DLO is compared
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An action that could be observed next, in words and as a trial whose goals are not known yet."""
+
+    action: str
+    words: str
+    trial: Trial
+
+
+@dataclass(frozen=True)
+class Advice:
+    """
+    The action that would tell most about a parameter.
+
+    :param action: its name, as in a request.
+    :param words: what to do.
+    :param parameter: that it would tell about.
+    :param std: of that parameter today, in the unit cube.
+    :param expected_std: with the action observed, too.
+    :param lower: expected 90 % interval in the unit cube, if the value stays; `upper` its other end.
+    """
+
+    action: str
+    words: str
+    parameter: str
+    std: float
+    expected_std: float
+    lower: float
+    upper: float
+
+
+def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
+           uncertainty: Uncertainty, length: float,
+           should_stop: Callable[[], bool] = lambda: False) -> Advice | None:
+    """
+    Return the action that reduces the largest uncertainty most; None where none helps.
+
+    Where none tells about the parameter that is known worst, the next one is looked at.
+
+    :param point: (d,) the found values in the unit cube.
+    :param uncertainty: today's, with a covariance.
+    :param length: of the DLO [m].
+    """
+    if uncertainty.covariance is None:
+        return None
+    expected = []
+    for candidate in candidates(trials):
+        if should_stop():
+            return None
+        try:
+            expected.append((candidate, expected_std(candidate.trial, space, simulator, point, uncertainty,
+                                                     length)))
+        except (SimulationError, InputError):
+            continue  # cannot be done with this DLO
+    for k in np.argsort(-uncertainty.std, kind='stable'):
+        now = float(uncertainty.std[k])
+        for candidate, std in sorted(expected, key=lambda pair: float(pair[1][k]))[:1]:
+            if std[k] < WORTH_IT * now:
+                reach = DEVIATIONS * float(std[k])
+                return Advice(candidate.action, candidate.words, space.free[k], now, float(std[k]),
+                              max(0.0, float(point[k]) - reach), min(1.0, float(point[k]) + reach))
+    return None
+
+
+def expected_std(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats,
+                 uncertainty: Uncertainty, length: float) -> Floats:
+    """
+    Return the (d,) standard deviations to expect when a trial is observed, too.
+
+    :raises SimulationError: where it cannot be simulated or does not come to rest.
+    """
+    assert uncertainty.covariance is not None
+    matrix = sensitivity(trial, space, simulator, point, uncertainty.std, length)
+    information = np.linalg.inv(uncertainty.covariance) + matrix.T @ matrix / uncertainty.residual**2
+    return np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats, std: Floats,
+                length: float) -> Floats:
+    """
+    Return (m, d) [m per unit cube]: how the simulated chains of a trial change with the parameters.
+
+    Central differences as wide as each parameter is unknown, because the chains need not be linear over
+    that.
+
+    :raises SimulationError: where a rollout diverges or does not come to rest.
+    """
+    columns = []
+    for k, step in enumerate(np.clip(std, SMALLEST_STEP, LARGEST_STEP)):
+        chains, values = [], []
+        for sign in (-1, 1):
+            beside = point.copy()
+            beside[k] = min(max(point[k] + sign * step, 0.0), 1.0)
+            rollout = simulator.simulate(trial, space.physical(space.values(beside), length))
+            if not all(rollout.settled):
+                raise SimulationError(f'trial {trial.name!r} does not come to rest')
+            chains.append(rollout.chains.ravel())
+            values.append(beside[k])
+        columns.append((chains[1] - chains[0]) / (values[1] - values[0]))
+    return np.stack(columns, axis=1)
+
+
+def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
+    """List actions that could be done next, from where a trial began."""
+    chain = next((trial.initial for trial in trials if trial.velocity is None), trials[0].initial)
+    length = chain.length
+    along = chain.points[-1] - chain.points[0]
+    across = np.array([-along[1], along[0], 0.0])
+    if not np.linalg.norm(across) > 1e-6 * length:
+        across = np.array([0.0, 1.0, 0.0])
+    side = tuple(float(one) for one in across / np.linalg.norm(across))
+    gap = float(np.linalg.norm(along))
+    cm = f'{30 * length:.0f} cm'
+    for fraction, place in ((0.0, 'the first end'), (0.5, 'the middle')):
+        height = 0.4 * length
+        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and hold it', chain,
+                              LiftAndHold(fraction=fraction, height=height))
+        yield from _candidate(f'lift {place} by {100 * height:.0f} cm and watch it while it moves', chain,
+                  XX
+    for fraction, place in ((0.0, 'the first end'), (0.25, 'a quarter of the length'), (0.5, 'the middle')):
+        yield from _candidate(f'drag {place} sideways by {cm}', chain,
+                              Drag(fraction=fraction, direction=side, distance=0.3 * length))
+        yield from _candidate(f'lift {place} and put it down {cm} to the side', chain,
+                              GraspAndPlace(fraction=fraction, direction=side, distance=0.3 * length))
+    yield from _candidate(
+        'lift the first end and lay it across the DLO, beyond two thirds of it', chain,
+        GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
+    yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
+                          TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
+    apart = 1.03 * length - gap
+    if apart > 0:
+        yield from _candidate(
+            f'grip both ends and pull them {100 * apart:.0f} cm apart, 3 % beyond the straight DLO', chain,
+            TwoHands(fractions=(0.0, 1.0), motion='apart', distance=apart))
+
+
+def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:
+    """Return a place a tenth of the length beside the DLO."""
+    place = chain.resample(np.array([fraction * chain.length]))[0]
+    return tuple(float(one) for one in place - 0.1 * chain.length * across / np.linalg.norm(across))
+
+
+def _candidate(words: str, chain: Chain, named: NamedAction, watched: bool = False) -> Iterator[Candidate]:
+    try:
+        action: Action = named.action(chain)
+    except InputError:
+        return  # not with a chain of this shape
+    held = tuple(hand.name for hand in action.hands) if named.hold else ()
+    goals = [Goal(chain, action.end + REST, held_by=held)]
+    if watched:
+        times = np.linspace(action.start, action.end, WATCHED + 1)[1:]
+        goals = [Goal(chain, float(time), stable=False, held_by=held) for time in times]
+    yield Candidate(named.name, words, Trial(words, chain, (action,), tuple(goals)))
