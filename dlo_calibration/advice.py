@@ -162,7 +162,7 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         yield from _candidate(f'lift {place} by {100 * height:.0f} cm and hold it', chain,
                               LiftAndHold(fraction=fraction, height=height))
         yield from _candidate(f'lift {place} by {100 * height:.0f} cm and watch it while it moves', chain,
-                  XX
+                              LiftAndHold(fraction=fraction, height=height, speed=0.5), watched=True)
     for fraction, place in ((0.0, 'the first end'), (0.25, 'a quarter of the length'), (0.5, 'the middle')):
         yield from _candidate(f'drag {place} sideways by {cm}', chain,
                               Drag(fraction=fraction, direction=side, distance=0.3 * length))

@@ -23,6 +23,7 @@ itself, and Bullet does contact and friction with everything else.
 from __future__ import annotations
 
 from contextlib import contextmanager
+import ctypes
 import os
 from typing import Any, Iterator, Mapping, Sequence
 
@@ -34,20 +35,26 @@ from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
 from dlo_calibration.parameters import GRAVITY
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
+from dlo_calibration.scene import Obstacle, read_scene, unusable
 from dlo_calibration.simulator import Rollout
 from dlo_calibration.trial import Trial
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep native code from writing to stderr."""
-    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Keep native code from writing to stdout and stderr."""
+    flush = ctypes.CDLL(None).fflush  # C buffers what it writes to a pipe
+    flush(None)
+    kept, nowhere = (os.dup(1), os.dup(2)), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     try:
         yield
     finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+        flush(None)
+        for stream, before in enumerate(kept, 1):
+            os.dup2(before, stream)
+            os.close(before)
         os.close(nowhere)
 
 
@@ -198,13 +205,57 @@ class BulletRope:
             pybullet.removeBody(body, physicsClientId=self._client)
 
 
+def _add_obstacle(client: int, obstacle: Obstacle) -> None:
+    """Put an obstacle into a world."""
+    sizes = obstacle.sizes.tolist()
+    shape = pybullet.createCollisionShape(physicsClientId=client, **{
+        'box': {'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]},
+        'sphere': {'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]},
+        'cylinder': {'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]},
+        'capsule': {'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]},
+        'mesh': {'shapeType': pybullet.GEOM_MESH, 'fileName': obstacle.file, 'meshScale': sizes,
+                 'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH},
+    }[obstacle.shape])
+    body = pybullet.createMultiBody(
+        0, shape, basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
+        useMaximalCoordinates=True, physicsClientId=client)
+    pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
+                            physicsClientId=client)
+
+
+def _obstacles(scene: str) -> tuple[Obstacle, ...]:
+    """
+    Return the obstacles of a scene, after trying to build them.
+
+    :raises InputError: where the file cannot be used.
+    """
+    found = read_scene(scene)
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        for obstacle in found:
+            try:
+                with _silence():
+                    _add_obstacle(client, obstacle)
+            except pybullet.error as error:
+                raise unusable(scene, f'a {obstacle.shape} {obstacle.file} that PyBullet cannot load',
+                               'export the mesh as .obj or .stl') from error
+    finally:
+        pybullet.disconnect(physicsClientId=client)
+    return found
+
+
 class BulletSimulator:
     """
-    Simulates trials in a PyBullet world of its own: the rope, and a table or none.
+    Simulates trials in a PyBullet world of its own: the rope, a table or none, and a scene or none.
 
     The world is built at the first trial and reset for every other.  The table
     is placed so that the rope rests on it at the measured height, whatever
     radius is tried, so that a radius neither kicks it up nor lets it fall.
+
+    Obstacles of a scene stay where they are, and the rope touches them with the
+    radius that is tried.  Bullet cannot change the radius of a sphere, so the
+    world is built anew for every other radius: about 20 ms, and what reading
+    the scene's meshes takes.
 
     :param table: whether there is a table.
     :param table_height: [m].
@@ -213,17 +264,21 @@ class BulletSimulator:
     :param stable_distance: see `Settling` [m].
     :param stable_time: see `Settling` [s].
     :param settle_limit: see `Settling` [s].
+    :param scene: path of a URDF file with fixed obstacles; empty: none.
+    :raises InputError: where the scene cannot be used.
     """
 
     name = 'bullet'
 
     def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
                  time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
-                 stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
+                 stable_time: float = Settling.time, settle_limit: float = Settling.limit,
+                 scene: str = '') -> None:
         self._table_height = table_height if table else None
         self._nodes = nodes
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
+        self._obstacles = _obstacles(scene) if scene else ()
         self._world: _World | None = None
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
@@ -241,8 +296,11 @@ class BulletSimulator:
             if touching is None:
                 touching = self._table_height + physical['self_collision']
             points = rest_on(points, touching)
+        radius = physical['self_collision'] if self._obstacles else _World.SPHERE
+        if self._world is not None and self._world.radius != radius:
+            self.close()
         if self._world is None:
-            self._world = _World(layout, physical, self._time_step)
+            self._world = _World(layout, physical, self._time_step, radius, self._obstacles)
         rope = self._world.start(layout.places, points, layout.velocities, physical, touching)
         return roll_out(trial, layout, rope, self._settling)
 
@@ -258,12 +316,18 @@ class BulletSimulator:
 
 
 class _World:
-    """A PyBullet client with a rope and a plane."""
+    """
+    A PyBullet client with a rope, a plane and obstacles.
 
-    SPHERE = 0.005  # m; the plane is placed to suit it
+    :param radius: [m] at which the rope touches them; the plane is placed to suit it.
+    """
+
+    SPHERE = 0.005  # m; the radius where there is a plane only
     AWAY = -1e3  # m: where there is no table
 
-    def __init__(self, layout: Layout, physical: Mapping[str, float], time_step: float) -> None:
+    def __init__(self, layout: Layout, physical: Mapping[str, float], time_step: float, radius: float,
+                 obstacles: Sequence[Obstacle]) -> None:
+        self.radius = radius
         self._client = pybullet.connect(pybullet.DIRECT)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=time_step, numSolverIterations=10, deterministicOverlappingPairs=1,
@@ -275,14 +339,19 @@ class _World:
                                                physicsClientId=self._client)
         pybullet.changeDynamics(self._plane, -1, lateralFriction=1.0, restitution=0.0,
                                 physicsClientId=self._client)
-        self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=self.SPHERE)
+        for obstacle in obstacles:
+            _add_obstacle(self._client, obstacle)
+        self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=radius)
+        self._among_obstacles = bool(obstacles)
 
     def start(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
               touching: float | None) -> BulletRope:
         """Place rope and table; `touching` [m] is the height of the rope's middle on the table."""
-        height = self.AWAY if touching is None else touching - self.SPHERE
+        height = self.AWAY if touching is None else touching - self.radius
         # Bullet keeps contact points from step to step; a step without any forgets the last trial's.
         self._place_table(self.AWAY)
+        if self._among_obstacles:
+            self._rope.reset(places, points + (0, 0, -self.AWAY), physical)
         pybullet.stepSimulation(physicsClientId=self._client)
         self._place_table(height)
         self._rope.reset(places, points, physical, velocities)

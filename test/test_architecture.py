@@ -34,7 +34,7 @@ ORDER = (
     'collector', 'recording', 'xml', 'description',
     'request', 'session',
     # engines
-    'layout', 'rollout', 'contact', 'rod', 'bullet', 'kernels', 'compiled', 'engines',
+    'layout', 'rollout', 'contact', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
     'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
     'options_node', 'node',
