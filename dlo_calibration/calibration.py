@@ -24,7 +24,8 @@ from typing import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.chain import Floats, frozen_array
-from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.confirmation import Confirmation, disagreements
+from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors, residuals, TrialScore
 from dlo_calibration.search import Observation, Search
@@ -103,6 +104,7 @@ class CalibrationResult:
     stop_reason: str
     seed: int | None = None
     warnings: tuple[str, ...] = ()
+    confirmation: Confirmation | None = None
 
     @property
     def values(self) -> dict[str, float]:
@@ -239,6 +241,42 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
         best=best, trials=tuple(trials), chains=simulated_chains(trials, best),
         evaluations=tuple(kept), seconds=clock() - started, search=search.name,
         engine=simulator.name, stop_reason=reason, seed=seed, warnings=_warnings(best, kept))
+
+
+def confirmed(result: CalibrationResult, simulator: Simulator,
+              should_stop: Callable[[], bool] = lambda: False,
+              clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
+    """
+    Return a result with what a second engine gives for its parameter set.
+
+    It costs one evaluation, which counts in `seconds` and not in `evaluations`.
+    Where the engines disagree, or the second one fails, the result stands, with a warning.
+
+    :param should_stop: asked between trials; once True, the result stays unconfirmed.
+    """
+    begun, name, best = clock(), simulator.name, result.best
+    confirmation, words = None, ''
+    try:
+        other = Evaluator(result.trials, result.space, simulator).evaluate(
+            best.index, best.point, should_stop)
+        if other.errors is None:
+            raise SimulationError(other.failure)
+    except CancelledError:
+        words = f'not confirmed by engine {name}: stopped on request'
+    except DloCalibrationError as error:
+        words = f'not confirmed by engine {name}: {error}'
+    else:
+        chains = simulated_chains(result.trials, other)
+        apart = np.concatenate([np.linalg.norm(one - two, axis=2).ravel()
+                                for one, two in zip(result.chains, chains, strict=True)])
+        confirmation = Confirmation(name, other.score, other.scores, other.errors,
+                                    float(apart.mean()), float(apart.max()))
+        found = disagreements([trial.name for trial in result.trials], result.chains, chains,
+                              best.scores, other.scores)
+        if found:
+            words = f'engine {name} disagrees with engine {result.engine}: {"; ".join(found)}'
+    return replace(result, confirmation=confirmation, seconds=result.seconds + clock() - begun,
+                   warnings=(*result.warnings, words) if words else result.warnings)
 
 
 def estimates(space: ParameterSpace, best: Evaluation, spread: Uncertainty) -> dict[str, ParameterEstimate]:

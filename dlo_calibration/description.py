@@ -26,10 +26,11 @@ from dataclasses import asdict, dataclass, field, fields
 import math
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
 from dlo_calibration.chain import Chain
+from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.errors import InputError
 from dlo_calibration.parameters import PARAMETERS, ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors
@@ -70,6 +71,7 @@ class Description:
     :param options: those in force, by name; empty where they were not given.
     :param trials: names of the trials.
     :param scores: difference score of each trial.
+    :param confirmation: what a second engine gave for the same parameters; None: none was asked.
     """
 
     parameters: Mapping[str, ParameterEstimate]
@@ -90,6 +92,7 @@ class Description:
     stop_reason: str
     options: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    confirmation: Confirmation | None = None
 
     def __post_init__(self) -> None:
         for name in ('parameters', 'fixed', 'options'):
@@ -107,7 +110,8 @@ class Description:
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
             errors=result.errors, search=result.search, engine=result.engine, seed=result.seed,
             evaluations=len(result.evaluations), simulations=result.simulations, seconds=result.seconds,
-            stop_reason=result.stop_reason, options=options or {}, warnings=result.warnings)
+            stop_reason=result.stop_reason, options=options or {}, warnings=result.warnings,
+            confirmation=result.confirmation)
 
     @property
     def values(self) -> dict[str, float]:
@@ -145,6 +149,8 @@ def description_document(found: CalibrationResult | Description,
     fit = add(calibration, 'fit', score=dlo.score, **asdict(dlo.errors))
     for name, score in zip(dlo.trials, dlo.scores, strict=True):
         add(fit, 'trial', name=name, score=score)
+    if dlo.confirmation is not None:
+        _add_confirmation(calibration, dlo.confirmation, dlo.trials)
     add_options(calibration, 'options', dlo.options)
     warnings = add(calibration, 'warnings')
     for text in dlo.warnings:
@@ -183,7 +189,7 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
         octets = octets.encode('utf-8', 'surrogatepass')
     root = parse(octets, where, ROOT)
     chain, parameters, calibration = root
-    fit, options, warnings = calibration
+    fit, *second, options, warnings = calibration
     seed = calibration.get('seed')
     try:
         dlo = Description(
@@ -192,12 +198,13 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
             chain=read_chain(where, chain), score=number(where, fit, 'score'),
             trials=tuple(trial.get('name') for trial in fit),
             scores=tuple(number(where, trial, 'score') for trial in fit),
-            errors=PointErrors(**{name: number(where, fit, name) for name in ERROR_NUMBERS}),
+            errors=_errors(where, fit),
             search=calibration.get('search'), engine=calibration.get('engine'),
             seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
             simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
             stop_reason=calibration.get('stop_reason'), options=read_options(where, options),
-            warnings=tuple(warning.get('text') for warning in warnings))
+            warnings=tuple(warning.get('text') for warning in warnings),
+            confirmation=_confirmation(where, second[0]) if second else None)
         space = dlo.space
     except InputError as error:
         if error.thing.startswith(where):
@@ -210,6 +217,25 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
     for element in parameters.findall('fixed'):
         _check_physical(where, element, space)
     return dlo
+
+
+def _add_confirmation(calibration: Any, found: Confirmation, trials: Sequence[str]) -> None:
+    element = add(calibration, 'confirmation', engine=found.engine, score=found.score,
+                  **asdict(found.errors), mean_distance=found.mean_distance, max_distance=found.max_distance)
+    for name, score in zip(trials, found.scores, strict=True):
+        add(element, 'trial', name=name, score=score)
+
+
+def _confirmation(where: str, element: Any) -> Confirmation:
+    return Confirmation(
+        engine=element.get('engine'), score=number(where, element, 'score'),
+        scores=tuple(number(where, trial, 'score') for trial in element), errors=_errors(where, element),
+        mean_distance=number(where, element, 'mean_distance'),
+        max_distance=number(where, element, 'max_distance'))
+
+
+def _errors(where: str, element: Any) -> PointErrors:
+    return PointErrors(**{name: number(where, element, name) for name in ERROR_NUMBERS})
 
 
 def _estimates(where: str, parameters: Any) -> dict[str, ParameterEstimate]:

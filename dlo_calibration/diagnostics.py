@@ -20,6 +20,7 @@ from __future__ import annotations
 from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.messages import MessageTypes
 from dlo_calibration.parameters import measured
 
@@ -81,8 +82,24 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
             'trials': len(found.trials), 'evaluations': len(found.evaluations),
             'simulations': found.simulations, 'seconds': found.seconds, 'engine': found.engine,
             'search': found.search, 'seed': '' if found.seed is None else found.seed,
-            'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings)}))
+            'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings),
+            **_confirmation(found.confirmation)}))
     return _diagnostics(types, stamp, statuses)
+
+
+def _confirmation(found: Confirmation | None) -> dict[str, Any]:
+    """Return what a second engine gave for the same parameters; nothing where none was asked."""
+    if found is None:
+        return {}
+    return {
+        'confirmation_engine': found.engine, 'confirmation_score': found.score,
+        'confirmation_scores': ' '.join(repr(float(s)) for s in found.scores),
+        'confirmation_mean_error_mm': found.errors.mean * 1e3,
+        'confirmation_rms_error_mm': found.errors.rms * 1e3,
+        'confirmation_max_error_mm': found.errors.max * 1e3,
+        'confirmation_mean_abs_error_mm': found.errors.mean_abs * 1e3,
+        'confirmation_mean_distance_mm': found.mean_distance * 1e3,
+        'confirmation_max_distance_mm': found.max_distance * 1e3}
 
 
 def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:

@@ -121,8 +121,20 @@ def error_facts(result: CalibrationResult) -> list[tuple[str, str]]:
                         f'in {result.seconds:.1f} s'),
         ('search', f'{result.search or "-"}, seed {"-" if result.seed is None else result.seed}'),
         ('engine', result.engine),
+        *_confirmation_facts(result),
         ('ended', result.stop_reason),
     ]
+
+
+def _confirmation_facts(result: CalibrationResult) -> list[tuple[str, str]]:
+    """Return what a second engine gave for the same parameters, if one was asked."""
+    other = result.confirmation
+    if other is None:
+        return []
+    return [(f'confirmed by {other.engine}',
+             f'difference score {other.score:.1f} cm, mean error {other.errors.mean * 1e3:.2f} mm; '
+             f'points {other.mean_distance * 1e3:.2f} mm from those of {result.engine}, '
+             f'{other.max_distance * 1e3:.2f} mm at most')]
 
 
 def unidentifiable_words(result: CalibrationResult) -> list[str]:

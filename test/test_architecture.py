@@ -28,7 +28,7 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 ORDER = (
     # pure NumPy and SciPy
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score', 'search',
-    'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
+    'confirmation', 'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',
