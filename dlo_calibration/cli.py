@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
+import shlex
 import shutil
 import sys
 import time
@@ -29,6 +30,7 @@ from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
 from dlo_calibration.calibration import CalibrationResult, Evaluator, simulated_chains
 from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
@@ -37,12 +39,12 @@ from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.trial import Trial
-from dlo_calibration.worker import calibrate_with, SimulatorFactory
+from dlo_calibration.worker import calibrate_with, confirmed_with, SimulatorFactory
 
 PROGRAM = 'dlo-calibration'
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' convention
 #: Options that say what was observed, not how it is simulated.
-OF_THE_SESSION = ('table', 'table_height', 'grip_tolerance', 'length_tolerance', 'release')
+OF_THE_SESSION = ('table', 'table_height', 'scene', 'grip_tolerance', 'length_tolerance', 'release')
 RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
 REQUEST = 'request.xml'
 
@@ -234,6 +236,7 @@ def _validate(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
     file = read_result(chosen.result)
     found = _read(chosen, _note, file.options)
     result = validated(file, _some(found), found.options, make_simulator)
+    result = confirmed_with(result, found.options, make_simulator)
     _print_result(result, chosen.json)
     return 0
 
@@ -305,7 +308,18 @@ def document(result: CalibrationResult) -> dict[str, Any]:
         'trials': len(result.trials), 'evaluations': len(result.evaluations),
         'simulations': result.simulations, 'seconds': result.seconds, 'engine': result.engine,
         'search': result.search, 'seed': result.seed, 'stop_reason': result.stop_reason,
-        'warnings': list(result.warnings)}
+        'warnings': list(result.warnings),
+        'confirmation': None if result.confirmation is None else _confirmation(result.confirmation)}
+
+
+def _confirmation(confirmation: Confirmation) -> dict[str, Any]:
+    """Return what a second engine gave, with the keys of the whole document."""
+    errors = confirmation.errors
+    return {
+        'engine': confirmation.engine, 'score': confirmation.score, 'scores': list(confirmation.scores),
+        'mean_error_m': errors.mean, 'rms_error_m': errors.rms, 'max_error_m': errors.max,
+        'mean_abs_error_m': errors.mean_abs, 'mean_distance_m': confirmation.mean_distance,
+        'max_distance_m': confirmation.max_distance}
 
 
 def _print_json(value: Mapping[str, Any], stream: TextIO) -> None:
@@ -357,7 +371,7 @@ def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult)
     write_evaluations(folder / EVALUATIONS, result)
     flags = [flag for name, value in found.options.flat().items() if value != Options().flat()[name]
              for flag in _as_flags(name, value)]
-    command = ' '.join([PROGRAM, 'fit', REQUEST if _is_request(source) else SESSION, *flags])
+    command = shlex.join([PROGRAM, 'fit', REQUEST if _is_request(source) else SESSION, *flags])
     write_report(folder / REPORT, result, command, [*found.session.problems, *found.refusals])
 
 

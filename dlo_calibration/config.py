@@ -29,7 +29,9 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.parameters import BY_NAME, measured, PAPER_PARAMETERS, PARAMETERS, ParameterSpace, SCALE
 from dlo_calibration.search import SEARCHES
 
-ENGINES = ('bullet',)
+AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
+CONFIRMING = 'bullet'
+ENGINES = (AUTO, CONFIRMING, 'compiled')
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,9 @@ class Options:
         'are reported per weight', unit='kg', minimum=0.0, maximum=1000.0)
     table: bool = _option(True, 'there is a table')
     table_height: float = _option(0.0, 'height of the table', unit='m', minimum=-100.0, maximum=100.0)
+    scene: str = _option(
+        '', 'path of a URDF file with fixed obstacles that the DLO touches, beside the table; relative to '
+        'the working directory; empty: none')
     calibrate: tuple[str, ...] = _option(
         PAPER_PARAMETERS, 'names of the parameters to find; the others keep their value',
         choices=tuple(BY_NAME))
@@ -105,7 +110,8 @@ class Options:
     evaluations: int = _option(PAPER_EVALUATIONS, "parameter sets to try at most (the paper's rounds)",
                                minimum=1, maximum=1000000)
     seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
-    engine: str = _option('bullet', 'simulation engine', choices=ENGINES)
+    engine: str = _option(AUTO, 'simulation engine; auto: compiled where it can be, and what it finds is '
+                          'simulated by bullet once more; else bullet', choices=ENGINES)
     workers: int = _option(0, 'number of processes that simulate; 0: one per core', minimum=0, maximum=1024)
     nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
     time_step: float = _option(0.004, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)

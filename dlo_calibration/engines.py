@@ -17,27 +17,82 @@
 
 from __future__ import annotations
 
-from typing import Callable, Mapping
+import functools
+import logging
+from typing import Any, Callable, Mapping
 
-from dlo_calibration.config import Options
+from dlo_calibration.config import AUTO, Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.simulator import Simulator
+
+INSTALL = 'pip install numba, or apt install python3-numba'
+SLOWER = 'rounds are simulated by PyBullet, about 15 times slower, because'
+LOG = logging.getLogger('dlo_calibration.engines')
 
 
 def _bullet(options: Options) -> Simulator:
     from dlo_calibration.bullet import BulletSimulator
 
-    return BulletSimulator(
-        table=options.table, table_height=options.table_height, nodes=options.nodes,
-        time_step=options.time_step, stable_distance=options.stable_distance,
-        stable_time=options.stable_time, settle_limit=options.settle_limit)
+    return BulletSimulator(**_settings(options), scene=options.scene)
+
+
+def _compiled(options: Options) -> Simulator:
+    if options.scene:
+        raise InputError('engine compiled', f'scene {options.scene}', 'no scene, for it knows only a table',
+                         'use engine bullet or auto')
+    try:
+        from dlo_calibration.compiled import CompiledSimulator
+    except ImportError as error:
+        raise InputError('engine compiled', f'a Python where {_lacks(error)}', 'an installed numba',
+                         f'{INSTALL}; or use engine bullet or auto') from error
+    return CompiledSimulator(**_settings(options))
+
+
+def _auto(options: Options) -> Simulator:
+    """Return the compiled engine where it can simulate, else Bullet, which is told once."""
+    if options.scene:
+        _tell(f'{SLOWER} engine compiled knows no scene: {options.scene}')
+        return _bullet(options)
+    try:
+        import dlo_calibration.compiled  # noqa: F401  only to see whether it can be
+    except ImportError as error:
+        _tell(f'{SLOWER} {_lacks(error)}: {INSTALL}')
+        return _bullet(options)
+    return _compiled(options)
+
+
+def _settings(options: Options) -> dict[str, Any]:
+    """Return what every engine is built with."""
+    return {'table': options.table, 'table_height': options.table_height, 'nodes': options.nodes,
+            'time_step': options.time_step, 'stable_distance': options.stable_distance,
+            'stable_time': options.stable_time, 'settle_limit': options.settle_limit}
+
+
+def _lacks(error: ImportError) -> str:
+    """Return why the compiled engine cannot be imported."""
+    if isinstance(error, ModuleNotFoundError) and error.name == 'numba':
+        return 'numba is not installed'
+    return f'numba cannot be used ({" ".join(str(error).split())})'
+
+
+@functools.cache
+def _tell(notice: str) -> None:
+    """Log a notice, once per process."""
+    LOG.warning(notice)
 
 
 #: name -> constructor; each imports its engine only when it is called
 ENGINES: Mapping[str, Callable[[Options], Simulator]] = {
+    AUTO: _auto,
     'bullet': _bullet,
+    'compiled': _compiled,
 }
 
 
 def make_simulator(options: Options) -> Simulator:
-    """Return the simulator that `options` ask for."""
+    """
+    Return the simulator that `options` ask for.
+
+    :raises InputError: where it cannot be had, or cannot represent the scene.
+    """
     return ENGINES[options.engine](options)

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections import deque
 import functools
+import logging
 import sys
 import time
 from typing import Any, Callable, Sequence
@@ -59,6 +60,7 @@ from dlo_calibration.options_node import OptionsNode
 from dlo_calibration.recorder import Recorder
 from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
 
+LOG = logging.getLogger('dlo_calibration')  # notices of the rest of the package
 DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains
 #: topic -> class, quality of service
 INPUTS = {
@@ -125,6 +127,18 @@ def spin(args: Sequence[str], should_stop: Callable[[], bool],
     return 0
 
 
+class _Notices(logging.Handler):
+    """Passes the package's notices on to the node's log."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        super().__init__()
+        self._tell = tell
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Pass one on."""
+        self._tell(record.getMessage())
+
+
 class CalibratorNode(OptionsNode):
     """
     The node `calibrator`.
@@ -139,6 +153,7 @@ class CalibratorNode(OptionsNode):
         self._types = messages.rclpy_types()
         self._collector = TrialCollector(self.options())
         self._collected_with = self.options()
+        self._make_simulator = make_simulator
         self._worker = Worker(make_simulator)
         self._recorder = Recorder(self._fail_to_record)
         self._calibrating: Options | None = None  # options of the calibration under way
@@ -147,6 +162,8 @@ class CalibratorNode(OptionsNode):
         self._forget()
         self._deaf: set[str] = set()
         self._closed = False
+        self._notices = _Notices(self._warn)
+        LOG.addHandler(self._notices)
         self._outputs = {name: self.create_publisher(kind, f'~/{name}', qos)
                          for name, (kind, qos) in OUTPUTS.items()}
         self._begin_session()
@@ -163,6 +180,7 @@ class CalibratorNode(OptionsNode):
         if self._closed:
             return
         self._closed = True
+        LOG.removeHandler(self._notices)
         self._worker.stop()
         try:
             if not self._worker.join(PATIENCE):
@@ -272,6 +290,7 @@ class CalibratorNode(OptionsNode):
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
+        self._make_simulator(options).close()  # refuses an engine or a scene that cannot be had
         self._recorder.start(options)
         self._started_by_itself = True  # whoever starts it, it need not start by itself any more
         self._calibrating, self._progress = options, Progress(options.evaluations, len(trials))
@@ -327,7 +346,11 @@ class CalibratorNode(OptionsNode):
         # A trial may have many goal chains; it is complete when the next one began, or nothing follows.
         if self._collector.count > wanted or time.monotonic() - self._last_heard > QUIET:
             self._started_by_itself = True
-            self.get_logger().info(self._start())
+            try:
+                self.get_logger().info(self._start())
+            except InputError as error:
+                self._state, self._detail = 'failed', str(error)
+                self.refuse(str(error))
 
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():

@@ -18,7 +18,7 @@
 from __future__ import annotations
 
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import queue
 import threading
 import time
@@ -26,14 +26,16 @@ import traceback
 from typing import Callable, Iterator, Sequence, Union
 
 from dlo_calibration import pool
-from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
-from dlo_calibration.config import Options
+from dlo_calibration.calibration import calibrate, CalibrationResult, confirmed, Evaluation
+from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
 
 SimulatorFactory = Callable[[Options], Simulator]
+
+STOPPED_PATIENCE = 5.0  # s that a confirmation may still take once it was asked to stop
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
     executor = pool.ProcessExecutor(workers) if workers > 1 else None
     simulator = make_simulator(options)
     try:
-        return calibrate(
+        result = calibrate(
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
     except BrokenProcessPool as error:
@@ -81,6 +83,31 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         if executor is not None:
             executor.close()
         simulator.close()
+    return confirmed_with(result, options, make_simulator, should_stop)
+
+
+def confirmed_with(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
+                   should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
+    """
+    Return a result with its confirmation, where `options` leave the choice of the engine open.
+
+    Whatever the confirming engine does, the result is not lost.
+    """
+    if options.engine != AUTO:
+        return result
+    begun = time.monotonic()
+    try:
+        simulator = make_simulator(replace(options, engine=CONFIRMING))
+        if simulator.name == result.engine:
+            return result
+        try:
+            return confirmed(result, simulator,
+                             lambda: should_stop() and time.monotonic() - begun > STOPPED_PATIENCE)
+        finally:
+            simulator.close()
+    except Exception as error:
+        text = ' '.join(f'{type(error).__name__}: {error}'.split())
+        return replace(result, warnings=(*result.warnings, f'not confirmed by engine {CONFIRMING}: {text}'))
 
 
 class Progress:

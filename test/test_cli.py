@@ -16,6 +16,7 @@
 """The command line: what it prints, where, and how it ends."""
 
 import csv
+import html
 import json
 import math
 import os
@@ -32,6 +33,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import cli
 from dlo_calibration.config import declarations, Options
+from dlo_calibration.description import read_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import bag_types, INITIAL
 from dlo_calibration.session import read_session
@@ -307,3 +309,38 @@ def test_output_folder_may_be_that_of_the_session(run, session, tmp_path):
     before = copy.read_bytes()
     assert run('fit', copy, '--output', tmp_path / 'out')[0] == 0
     assert Path(copy).read_bytes() == before
+
+
+SCENE = ('<robot name="box"><link name="box"><collision><origin xyz="5 0 0"/><geometry>'
+         '<box size="1 1 1"/></geometry></collision></link></robot>')
+
+
+def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsys):
+    """The scene is recorded as it was given, found from the working directory, and named in the report."""
+    monkeypatch.chdir(tmp_path)
+    Path('my scene.urdf').write_text(SCENE, encoding='utf-8')
+    session = write_session(tmp_path / 'recorded', session_messages(TYPES, 1),
+                            {'scene': 'my scene.urdf', 'evaluations': 2, 'workers': 1, 'settle_limit': 0.5})
+    documents = []
+    for source in (session, 'out/session.mcap'):
+        assert cli.main(['fit', str(source), '--json', '--output', 'out']) == 0
+        documents.append(json.loads(capsys.readouterr().out))
+    first, again = ({key: value for key, value in one.items() if key != 'seconds'} for one in documents)
+    assert first == again
+    assert (first['engine'], first['confirmation']) == ('bullet', None)
+    assert read_result('out/result.xml').options['scene'] == 'my scene.urdf'
+    assert "--scene 'my scene.urdf'" in html.unescape(Path('out/report.html').read_text(encoding='utf-8'))
+    assert cli.main(['validate', 'out/result.xml', str(session), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['score'] == first['score']
+    Path('my scene.urdf').unlink()
+    assert cli.main(['fit', str(session)]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith('dlo-calibration: scene my scene.urdf: got ')
+    assert 'relative to the working directory' in error
+
+
+def test_compiled_engine_and_scene_end_with_one_line(session, capsys):
+    assert cli.main(['fit', str(session), '--engine', 'compiled', '--scene', 'peg.urdf']) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        'dlo-calibration: engine compiled: got scene peg.urdf, expected no scene, for it knows only a table; '
+        'use engine bullet or auto')

@@ -33,7 +33,7 @@ CONTRACT = {
     'calibrate': ['flexibility', 'elasticity', 'friction', 'self_collision'],
     'search': 'random', 'evaluations': 150, 'grip_tolerance': 0.02, 'length_tolerance': 50.0,
     'start_after_trials': 0, 'output_directory': '.', 'record': True, 'release': True,
-    'engine': 'bullet', 'workers': 0,
+    'engine': 'auto', 'workers': 0,
 }
 MORE = {'seed', 'stable_distance', 'stable_time', 'settle_limit'}
 

@@ -12,127 +12,116 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One contract for every engine, on small trials."""
+"""The choice of an engine: what each name gives, what it refuses, and what is told."""
 
-import pickle
+import logging
+import sys
 
-import numpy as np
 import pytest
 
-from dlo_calibration import Action, Chain, Goal, Hand, PARAMETERS, ParameterSpace, Trial
+from dlo_calibration import engines
+from dlo_calibration.bullet import BulletSimulator
 from dlo_calibration.config import ENGINES as NAMES
 from dlo_calibration.config import Options
 from dlo_calibration.engines import ENGINES, make_simulator
+from dlo_calibration.errors import InputError
+from dlo_calibration.worker import calibrate_with
 
-SPACE = ParameterSpace(tuple(parameter.name for parameter in PARAMETERS))
-MIDDLE = {'flexibility': 60.0, 'elasticity': 40.0, 'friction': 60.0, 'self_collision': 25.0, 'damping': 50.0,
-          'internal_damping': 25.0, 'mass': 40.0}
-
-
-def trial(held_by=()):
-    """Lay the end of a short rope across its beginning: it bends, stretches, slides, and touches itself."""
-    x = np.linspace(0, 0.4, 15)
-    points = np.stack([x, 0.01 * np.sin(8 * x), 0 * x + 0.005], axis=1)
-    path = [points[14], (0.35, -0.02, 0.06), (0.2, -0.06, 0.06), (0.1, 0.04, 0.02)]
-    hand = Hand('hand', (14,), [0.0, 0.3, 0.8, 1.1], path)
-    other = Hand('other', (0,), [0.0, 1.1], [points[0]] * 2)
-    goals = (Goal(Chain(points), 0.5, stable=False), Goal(Chain(points), 2.0, held_by=held_by))
-    return Trial('fold', Chain(points), (Action((hand, other)),), goals)
+BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
+       '</collision></link></robot>')
+COMPILED = 'dlo_calibration.compiled'
 
 
-def simulator(name):
-    return make_simulator(Options(engine=name, nodes=21, settle_limit=1.0))
+@pytest.fixture
+def notices(caplog):
+    """Give a function that returns what was told since this process began, which is now."""
+    engines._tell.cache_clear()
+    caplog.set_level(logging.WARNING, 'dlo_calibration')
+    return lambda: [record.getMessage() for record in caplog.records]
 
 
-def rollout(simulator, trial=trial(), **values):  # noqa: B008  a trial is frozen
-    return simulator.simulate(trial, SPACE.physical({**MIDDLE, **values}, 0.4))
+@pytest.fixture
+def without_numba(monkeypatch):
+    """Let numba not be installed."""
+    monkeypatch.setitem(sys.modules, 'numba', None)
+    monkeypatch.delitem(sys.modules, COMPILED, raising=False)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Give the path of a scene."""
+    (tmp_path / 'box.urdf').write_text(BOX, encoding='utf-8')
+    return str(tmp_path / 'box.urdf')
 
 
 def test_what_can_be_chosen_can_be_made():
-    assert tuple(ENGINES) == NAMES
+    assert set(ENGINES) == set(NAMES)
+    assert Options().engine == 'auto'
 
 
-@pytest.fixture(params=ENGINES)
-def engine(request):
-    made = simulator(request.param)
-    yield made
-    made.close()
+def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
+    pytest.importorskip('numba')
+    for engine in ('auto', 'compiled'):
+        assert make_simulator(Options(engine=engine)).name == 'compiled'
+    assert notices() == []
 
 
-def test_a_rollout_answers_every_goal_with_finite_chains(engine):
-    found = rollout(engine)
-    assert found.chains.shape == (2, 15, 3)
-    assert np.isfinite(found.chains).all()
-    assert len(found.settled) == 2
-    assert found.settled[0]
-    assert found.steps > 0
-    assert found.duration == pytest.approx(found.steps * Options().time_step)
-    with pytest.raises(ValueError):
-        found.chains[0] = 0
-    # The hand was there at half a second: two fifths of the way from its second waypoint to its third.
-    assert found.chains[0, 14] == pytest.approx((0.29, -0.036, 0.06), abs=2e-3)
+def test_bullet_is_one_option_away(notices):
+    simulator = make_simulator(Options(engine='bullet'))
+    assert type(simulator) is BulletSimulator
+    assert simulator.name == 'bullet'
+    assert notices() == []
 
 
-def test_it_is_known_by_its_name():
-    for name in ENGINES:
-        assert simulator(name).name == name
+def test_without_numba_auto_is_bullet_and_says_so_once(without_numba, notices):
+    for _ in range(3):
+        assert type(make_simulator(Options())) is BulletSimulator
+    assert notices() == ['rounds are simulated by PyBullet, about 15 times slower, because numba is not '
+                         'installed: pip install numba, or apt install python3-numba']
 
 
-def test_the_same_call_gives_the_same_rollout_bit_for_bit(engine):
-    first = rollout(engine)
-    rollout(engine, trial(held_by=('hand',)), friction=5.0)
-    again = rollout(engine)
-    fresh = rollout(simulator(engine.name))
-    assert first.chains.tobytes() == again.chains.tobytes() == fresh.chains.tobytes()
-    assert first.steps == again.steps == fresh.steps
+def test_without_numba_the_compiled_engine_is_refused(without_numba):
+    with pytest.raises(InputError) as refusal:
+        make_simulator(Options(engine='compiled'))
+    assert str(refusal.value) == (
+        'engine compiled: got a Python where numba is not installed, expected an installed numba; pip install '
+        'numba, or apt install python3-numba; or use engine bullet or auto')
 
 
-def test_it_goes_to_other_processes_before_and_after_use(engine):
-    unused = pickle.loads(pickle.dumps(engine))  # noqa: S301
-    first = rollout(engine)
-    used = pickle.loads(pickle.dumps(engine))  # noqa: S301
-    for copy in (unused, used):
-        assert rollout(copy).chains.tobytes() == first.chains.tobytes()
-        copy.close()
-    assert rollout(engine).chains.tobytes() == first.chains.tobytes()
+def test_a_numba_that_does_not_fit_is_not_called_missing(monkeypatch, notices):
+    class Broken:
+        def find_spec(self, name, *_):
+            if name == COMPILED:
+                raise ImportError('Numba needs NumPy 2.0 or less')
+
+    monkeypatch.delitem(sys.modules, COMPILED, raising=False)
+    monkeypatch.setattr(sys, 'meta_path', [Broken(), *sys.meta_path])
+    assert make_simulator(Options()).name == 'bullet'
+    notice, = notices()
+    assert 'because numba cannot be used (Numba needs NumPy 2.0 or less): pip install' in notice
 
 
-def test_it_can_be_closed_at_any_time_and_used_again(engine):
-    engine.close()
-    first = rollout(engine)
-    engine.close()
-    engine.close()
-    assert rollout(engine).chains.tobytes() == first.chains.tobytes()
+def test_the_compiled_engine_refuses_a_scene_by_name(scene):
+    with pytest.raises(InputError) as refusal:
+        make_simulator(Options(engine='compiled', scene=scene))
+    assert str(refusal.value) == (f'engine compiled: got scene {scene}, expected no scene, for it knows only '
+                                  'a table; use engine bullet or auto')
 
 
-def test_two_at_a_time_do_not_disturb_each_other(engine):
-    alone = rollout(engine)
-    other = simulator(engine.name)
-    rollout(other, friction=5.0)
-    assert rollout(engine).chains.tobytes() == alone.chains.tobytes()
-    other.close()
-    assert rollout(engine).chains.tobytes() == alone.chains.tobytes()
+def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
+    for _ in range(2):
+        assert make_simulator(Options(scene=scene)).name == 'bullet'
+    assert notices() == [f'rounds are simulated by PyBullet, about 15 times slower, because engine compiled '
+                         f'knows no scene: {scene}']
 
 
-@pytest.mark.parametrize('name', [parameter.name for parameter in PARAMETERS])
-def test_every_parameter_changes_the_rollout(engine, name):
-    # Internal damping that is less than the time step's own does nothing.
-    values = (65.0, 95.0) if name == 'internal_damping' else (MIDDLE[name] - 20, MIDDLE[name] + 20)
-    low, high = (rollout(engine, **{name: value}).chains for value in values)
-    assert np.abs(high - low).max() > 1e-4
+@pytest.mark.parametrize('engine', ['auto', 'bullet'])
+def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engine):
+    options = Options(engine=engine, scene='nowhere.urdf', workers=1)
+    with pytest.raises(InputError, match='scene nowhere.urdf: got .*No such file.*expected a URDF file'):
+        calibrate_with((), options, make_simulator)
 
 
-def test_a_held_end_stays_with_its_hand_and_a_released_one_does_not(engine):
-    held = rollout(engine, trial(held_by=('hand',))).chains[1, 14]
-    assert held == pytest.approx((0.1, 0.04, 0.02), abs=1e-6)
-    assert np.abs(rollout(engine).chains[1, 14] - held).max() > 1e-4
-
-
-def test_options_reach_the_engine():
-    for name in ENGINES:
-        falling = make_simulator(Options(engine=name, table=False, settle_limit=0.5, time_step=0.005))
-        found = rollout(falling)
-        assert found.settled == (True, False)
-        assert found.chains[1, :, 2].max() < -0.5
-        assert found.duration < 2.0 + 0.5 + 0.05
-        falling.close()
+def test_a_path_is_relative_to_the_working_directory(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert make_simulator(Options(engine='bullet', scene='box.urdf')).name == 'bullet'

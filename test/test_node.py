@@ -18,6 +18,7 @@
 from contextlib import contextmanager
 import functools
 import json
+import logging
 import os
 from pathlib import Path
 import signal
@@ -50,6 +51,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from dlo_calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.node import CalibratorNode  # noqa: E402
 
 PATIENCE = 60.0  # s
@@ -390,6 +392,36 @@ def test_failure_of_the_engine_reaches_status_and_the_node_stays(start_node):
     assert robot.call('start').success
     robot.until(lambda: robot.heard['result'])
     robot.until_status(state='done')
+
+
+def test_a_scene_that_cannot_be_used_is_refused_at_the_start_and_the_node_stays(start_node):
+    robot = start_node(scene='nowhere.urdf')
+    robot.calibrator._make_simulator = make_simulator  # in place of the toy's factory
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    answer = robot.call('start')
+    assert not answer.success
+    assert answer.message.startswith('scene nowhere.urdf: got ')
+    robot.until_status(state='collecting', last_refusal=answer.message)
+    robot.calibrator.set_parameters([Parameter('scene', value='')])
+    assert robot.call('start').success
+    robot.until_result()
+
+
+def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start_node):
+    robot = start_node(scene='nowhere.urdf', start_after_trials=1)
+    robot.calibrator._make_simulator = make_simulator
+    robot.send(session_messages(TYPES, 1))
+    robot.until(lambda: robot.status['state'] == 'failed')
+    assert robot.status['detail'].startswith('scene nowhere.urdf: got ')
+    assert robot.status['detail'] == robot.status['last_refusal']
+
+
+def test_notices_of_the_package_are_in_the_log_of_the_node(start_node):
+    robot = start_node()
+    logging.getLogger('dlo_calibration.engines').warning('numba is not installed')
+    robot.until(lambda: any(entry.msg == 'numba is not installed' and entry.level == LOG_WARN
+                            for entry in robot.heard['log']))
 
 
 def test_disk_that_refuses_is_reported_and_the_node_goes_on(start_node, tmp_path):

@@ -1,0 +1,236 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A second engine that confirms what a first one found."""
+
+import json
+
+import numpy as np
+import pytest
+from toy_messages import session_messages, toy_trials, TRUTH, write_session
+from toy_simulator import ToySimulator
+
+from dlo_calibration import cli, diagnostics, Rollout, SimulationError
+from dlo_calibration.calibration import calibrate, confirmed
+from dlo_calibration.config import Options
+from dlo_calibration.confirmation import disagreements
+from dlo_calibration.description import read_result, write_result
+from dlo_calibration.messages import bag_types
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.report import write_report
+from dlo_calibration.score import PointErrors, residuals, trial_score
+from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.terminal import error_facts
+from dlo_calibration.worker import calibrate_with
+
+OPTIONS = Options(evaluations=20, workers=1)
+
+
+class SecondToy(ToySimulator):
+    """
+    Another engine, that moves every point of some trials.
+
+    :param shift: [m] along y.
+    :param only: names of the trials; None: all.
+    :param failure: raised in place of simulating.
+    """
+
+    name = 'second toy'
+
+    def __init__(self, shift=0.0, only=None, failure=None):
+        super().__init__()
+        self.shift, self.only, self.failure = shift, only, failure
+
+    def simulate(self, trial, physical):
+        if self.failure is not None:
+            raise self.failure
+        found = super().simulate(trial, physical)
+        if self.only is not None and trial.name not in self.only:
+            return found
+        return Rollout(found.chains + (0, self.shift, 0), found.settled, found.duration, found.steps)
+
+
+def found(second, clock=lambda: 0.0):
+    trials = toy_trials(2)
+    result = calibrate(trials, ParameterSpace(), ToySimulator(), RandomSearch(4, 1), budget=20, clock=clock)
+    return result, confirmed(result, second, clock=clock)
+
+
+def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
+    before, after = found(SecondToy(0.004))
+    assert after.values == before.values
+    assert (after.best, after.engine, after.evaluations) == (before.best, 'toy', before.evaluations)
+    other = after.confirmation
+    assert other.engine == 'second toy'
+    assert other.mean_distance == pytest.approx(0.004)
+    assert other.max_distance == pytest.approx(0.004)
+    moved = [chains + (0, 0.004, 0) for chains in after.chains]
+    assert other.scores == pytest.approx([trial_score(*one) for one in zip(after.trials, moved, strict=True)])
+    assert other.score == pytest.approx(np.mean(other.scores))
+    residual = np.concatenate([residuals(*one) for one in zip(after.trials, moved, strict=True)])
+    assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
+
+
+def test_it_costs_time_and_no_evaluation():
+    now = iter(range(100))
+    before, after = found(SecondToy(), clock=lambda: float(next(now)))
+    assert after.seconds == before.seconds + 1
+    assert after.simulations == before.simulations
+
+
+def test_engines_that_agree_cause_no_warning():
+    for shift in (0.0, 1e-5):
+        before, after = found(SecondToy(shift))
+        assert after.confirmation is not None
+        assert after.warnings == before.warnings == ()
+
+
+def test_a_disagreement_names_the_trial_and_how_much():
+    _, after = found(SecondToy(0.01, only=('trial 2',)))
+    warning, = after.warnings
+    assert warning.startswith('engine second toy disagrees with engine toy: trial 2: points 10.00 mm apart')
+    assert 'trial 1' not in warning
+    assert f'instead of {after.best.scores[1]:.2f}' in warning
+    assert after.confirmation.max_distance == pytest.approx(0.01)
+    assert after.confirmation.mean_distance == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(('shift', 'score', 'other', 'tells'), [
+    (0.0004, 1.0, 1.0, False), (0.0006, 1.0, 1.0, True),
+    (0.0, 1.0, 1.09, False), (0.0, 1.0, 1.11, True), (0.0, 1.11, 1.0, True),
+    (0.0, 10.0, 10.4, False), (0.0, 10.0, 10.6, True)])
+def test_tolerances(shift, score, other, tells):
+    chain = np.zeros((1, 5, 3))
+    assert bool(disagreements(['a'], [chain], [chain + (shift, 0, 0)], [score], [other])) is tells
+
+
+def test_a_second_engine_that_fails_leaves_the_result_with_a_warning():
+    before, after = found(SecondToy(failure=SimulationError('the rollout diverged')))
+    assert after.confirmation is None
+    assert after.values == before.values
+    assert after.warnings == ('not confirmed by engine second toy: the rollout diverged',)
+
+
+def engines(second):
+    """Return a factory: the toy, and where PyBullet itself is asked for, another engine."""
+    return lambda options: second if options.engine == 'bullet' else ToySimulator()
+
+
+def test_auto_confirms_and_a_named_engine_does_not():
+    trials = toy_trials(1)
+    result = calibrate_with(trials, OPTIONS, engines(SecondToy(0.001)))
+    assert (result.engine, result.confirmation.engine) == ('toy', 'second toy')
+    named = Options.of({**OPTIONS.flat(), 'engine': 'compiled'})
+    assert calibrate_with(trials, named, engines(SecondToy(0.001))).confirmation is None
+    # Where auto is PyBullet already, it is not asked twice.
+    assert calibrate_with(trials, OPTIONS, lambda _: SecondToy()).confirmation is None
+
+
+@pytest.mark.parametrize('failure', [RuntimeError('broken\nhere'), MemoryError()])
+def test_a_second_engine_that_breaks_does_not_lose_the_result(failure):
+    result = calibrate_with(toy_trials(1), OPTIONS, engines(SecondToy(failure=failure)))
+    assert result.confirmation is None
+    assert 'not confirmed by engine bullet: ' + type(failure).__name__ in result.warnings[-1]
+    assert '\n' not in result.warnings[-1]
+
+
+def test_a_second_engine_that_cannot_be_made_does_not_lose_the_result():
+    def make(options):
+        if options.engine == 'bullet':
+            raise ImportError('no pybullet')
+        return ToySimulator()
+    assert 'no pybullet' in calibrate_with(toy_trials(1), OPTIONS, make).warnings[-1]
+
+
+def test_a_stopped_search_is_confirmed_too():
+    count = []
+    result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy(0.001)), count.append,
+                            lambda: len(count) >= 3)
+    assert len(result.evaluations) == 3
+    assert result.confirmation.mean_distance == pytest.approx(0.001)
+
+
+def test_a_confirmation_that_takes_too_long_after_a_stop_is_given_up(monkeypatch):
+    monkeypatch.setattr('dlo_calibration.worker.STOPPED_PATIENCE', -1.0)
+    count = []
+    result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy()), count.append,
+                            lambda: len(count) >= 3)
+    assert result.confirmation is None
+    assert result.warnings == ('not confirmed by engine second toy: stopped on request',)
+
+
+@pytest.fixture
+def command(capsys, tmp_path):
+    """Give a function that does what a command line says on a session, and returns its JSON document."""
+    session = write_session(tmp_path / 'recorded', session_messages(bag_types(), 2),
+                            {'evaluations': 20, 'workers': 1})
+
+    def act(verb, *words):
+        capsys.readouterr()
+        before = (tmp_path / 'out/result.xml',) if verb == 'validate' else ()
+        assert cli.main([str(word) for word in (verb, *before, session, '--json', *words)],
+                        engines(SecondToy(0.004))) == 0
+        return json.loads(capsys.readouterr().out)
+    return act
+
+
+def test_fit_and_validate_tell_both_engines(command, tmp_path):
+    fitted = command('fit', '--output', tmp_path / 'out')
+    checked = command('validate')
+    for document in (fitted, checked):
+        assert document['engine'] == 'toy'
+        other = document['confirmation']
+        assert (other['engine'], len(other['scores'])) == ('second toy', 2)
+        assert other['mean_distance_m'] == pytest.approx(0.004)
+        assert other['max_distance_m'] == pytest.approx(0.004)
+        assert 'second toy disagrees' in document['warnings'][-1]
+    assert checked['score'] == fitted['score']
+    assert checked['confirmation'] == fitted['confirmation']
+    assert fitted['evaluations'] == 20
+    assert read_result(tmp_path / 'out/result.xml').confirmation.score == fitted['confirmation']['score']
+    assert command('fit', '--engine', 'compiled')['confirmation'] is None
+
+
+def test_people_are_told(tmp_path):
+    before, after = found(SecondToy(0.004))
+    assert dict(error_facts(after))['confirmed by second toy'].endswith(
+        'points 4.00 mm from those of toy, 4.00 mm at most')
+    assert 'confirmed by second toy' not in dict(error_facts(before))
+    write_report(tmp_path / 'report.html', after, 'fit')
+    assert 'confirmed by second toy' in (tmp_path / 'report.html').read_text(encoding='utf-8')
+
+
+def test_result_files_hold_it_exactly(tmp_path):
+    before, after = found(SecondToy(1 / 300))
+    for result in (before, after):
+        write_result(tmp_path / 'result.xml', result)
+        assert read_result(tmp_path / 'result.xml').confirmation == result.confirmation
+
+
+def test_the_message_holds_it():
+    before, after = found(SecondToy(0.004))
+    whole = {pair.key: pair.value for pair in diagnostics.result(bag_types(), after, 0).status[-1].values}
+    assert whole['confirmation_engine'] == 'second toy'
+    assert float(whole['confirmation_score']) == after.confirmation.score
+    assert [float(word) for word in whole['confirmation_scores'].split()] == list(after.confirmation.scores)
+    assert float(whole['confirmation_mean_distance_mm']) == pytest.approx(4.0)
+    bare = diagnostics.result(bag_types(), before, 0).status[-1].values
+    assert not any(pair.key.startswith('confirmation') for pair in bare)
+
+
+def test_truth_is_where_the_toy_says():
+    """Both engines agree at the truth itself, with scores of nothing."""
+    trial, = toy_trials(1)
+    physical = ParameterSpace().physical(TRUTH, trial.initial.length)
+    assert trial_score(trial, SecondToy().simulate(trial, physical).chains) == pytest.approx(0, abs=1e-9)
