@@ -27,14 +27,15 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 #: A module imports only from those before it; the modules of a subpackage share its place.
 ORDER = (
     # pure NumPy and SciPy
-    'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score', 'search',
-    'confirmation', 'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
+    'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
+    'layout', 'noise', 'suspension', 'estimate', 'excitation',
+    'search', 'confirmation', 'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',
     'request', 'session',
     # engines
-    'layout', 'rollout', 'contact', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
+    'rollout', 'contact', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
     'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
     'options_node', 'node',

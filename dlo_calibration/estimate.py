@@ -1,0 +1,313 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Estimate: what the observed chains alone say of the parameters, before anything is simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration.chain import Chain, Floats, frozen_array, MINIMUM_SPACING
+from dlo_calibration.layout import RESTING_BAND, resting_level
+from dlo_calibration.noise import noise, smooth
+from dlo_calibration.parameters import BY_NAME, GRAVITY, measured, ParameterSpace, SCALE
+from dlo_calibration.suspension import Balance, balance, hanging_parts
+from dlo_calibration.trial import Trial
+
+SIGMAS = 3.0  # of noise that a range leaves room for
+STIFFNESS_MARGIN = 2.0  # factor, either way, for natural curvature, twist and all that is left out
+FRICTION_MARGIN = 3.0  # factor, for what smoothing does to the curvature of a resting DLO
+RADIUS_MARGIN = 1.2  # factor, for cut corners
+UNKNOWN_NOISE = 2e-3  # m, of chains with too few points to tell
+SMALLEST_NOISE = 2e-4  # m, of points that seem to have none: the model is not better than that
+LYING = 0.003  # m above the level, at least: below it a point may touch the table
+SMOOTHER = 1.3  # times the noise: too smooth a curve bends less, which leaves bounds true
+VISIBLE = 5.0  # times the noise
+SAMPLES = 160  # of a curve, about
+SHORTEST = 0.5  # of the DLO, of a stretch whose straightening is looked at
+RADII = 60  # that are tried
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    What is known of one parameter, on the 0..100 scale.
+
+    :param value: nan where there is none.
+    :param lower: the truth is not below, as far as the model holds; 0 where nothing is known.
+    :param upper: nor above; 100 where nothing is known.
+    :param origin: where it came from, in words.
+    """
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+    origin: str
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """
+    What is known of every free parameter.
+
+    :param noise: standard deviation of a coordinate of the chains [m]; nan where it is not known.
+    """
+
+    parameters: Mapping[str, Estimate]
+    noise: float
+
+    def cube(self) -> tuple[Floats, Floats, Floats]:
+        """Return start (nan where there is none), lower and upper, (d,) each, in the unit cube."""
+        table = np.array([(e.value, e.lower, e.upper) for e in self.parameters.values()]) / SCALE
+        start, lower, upper = (frozen_array(column) for column in table.T)
+        return start, lower, upper
+
+
+@dataclass(frozen=True)
+class _Resting:
+    """
+    What all chains at rest say together.
+
+    :param load: w / EI [1/m^3] of the hanging parts: best, least and most.
+    :param stretch: w / EA [1/m] of them: best, least and most.
+    :param parts: how many hang.
+    :param hold: mu w / EI that keeps the DLO bent on the table, at least [1/m^3]; 0: nothing lies bent.
+    """
+
+    load: tuple[float, float, float]
+    stretch: tuple[float, float, float]
+    parts: int
+    hold: float
+
+
+def estimate(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Estimates:
+    """
+    Estimate the free parameters from the chains alone.
+
+    Flexibility and elasticity: from the balance of moments of the parts that hang
+    (see `suspension`), with three standard deviations of the noise and a factor of
+    two either way.  Friction: it holds a DLO bent on the table against its
+    stiffness; a lower bound, a third of what the curve says.  Self-collision
+    radius: parts that are no neighbours were seen no nearer; an upper bound.
+    Damping and mass: nothing.
+
+    :param table_height: [m]; None where there is no table.
+    """
+    seen = noise(trials)
+    sigma = UNKNOWN_NOISE if math.isnan(seen) else max(SMALLEST_NOISE, seen)
+    length = float(np.median([trial.initial.length for trial in trials]))
+    resting = _resting(trials, table_height, sigma)
+    weight = math.nan if 'mass' in space.free else space.physical({}, length)['mass'] / length * GRAVITY
+    known = {'flexibility': _flexibility(resting, weight), 'elasticity': _elasticity(resting, weight),
+             'friction': _friction(resting), 'self_collision': _self_collision(trials, table_height, sigma)}
+    return Estimates({name: known.get(name) or _nothing(name, 'shapes at rest do not tell it')
+                      for name in space.free}, seen)
+
+
+def _nothing(name: str, reason: str) -> Estimate:
+    return Estimate(name, math.nan, 0.0, SCALE, reason)
+
+
+def _scaled(name: str, value: float, lowest: float, highest: float, origin: str) -> Estimate:
+    """Return an estimate of a physical value > 0, or nan, and of its physical range, within the scale."""
+    def scaled(physical: float) -> float:
+        return min(SCALE, max(0.0, BY_NAME[name].value(physical)))
+
+    lower, upper = sorted((scaled(lowest), scaled(highest)))
+    at = value if math.isnan(value) else min(upper, max(lower, scaled(value)))
+    return Estimate(name, at, lower, upper, origin)
+
+
+def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) -> _Resting:
+    """Look at all chains at rest."""
+    balances: list[Balance] = []
+    hold = 0.0
+    for trial in trials:
+        initial = _smoothed(trial.initial, sigma)
+        places = initial.arc_lengths()
+        level = None if table_height is None else resting_level(trial, table_height)
+        if level is None and table_height is not None:
+            level = table_height
+        margin = max(LYING, SIGMAS * sigma)
+        lying = [trial.initial] if trial.velocity is None else []
+        for goal in trial.goals:
+            if not goal.stable:
+                continue
+            hands = trial.holding(goal)
+            clamps = [grip for hand in hands if len(hand.grips) > 1 for grip in hand.grips]
+            pins = [hand.grips[0] for hand in hands if len(hand.grips) == 1]
+            points = goal.chain.points
+            touching = _near_itself(points, places, sigma)
+            for part in hanging_parts(points, level, margin, clamps, pins, touching):
+                found = balance(points, places, part, sigma)
+                if found is not None:
+                    balances.append(found)
+            if not hands:
+                lying.append(goal.chain)
+        for chain in lying:
+            if level is not None and (chain.points[:, 2] < level + RESTING_BAND + SIGMAS * sigma).all() \
+                    and not _near_itself(chain.points, places, sigma):
+                hold = max(hold, _straightening(_smoothed(chain, sigma), VISIBLE * sigma))
+    return _Resting(_combined([(b.load, b.std) for b in balances]),
+                    _combined([(b.stretch, b.stretch_std) for b in balances]), len(balances), hold)
+
+
+def _smoothed(chain: Chain, sigma: float) -> Chain:
+    """Return a chain without as much of its roughness as is noise."""
+    smoothed = smooth(chain.points, chain.arc_lengths(), SMOOTHER * sigma)
+    steps = np.linalg.norm(np.diff(smoothed, axis=0), axis=1)
+    return Chain(smoothed) if (steps > MINIMUM_SPACING).all() else chain
+
+
+def _combined(found: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+    """Return the weighted mean of values with their standard deviations, and its range; nan of none."""
+    usable = [(value, std) for value, std in found if np.isfinite(value) and np.isfinite(std) and std > 0]
+    if not usable:
+        return math.nan, -math.inf, math.inf
+    values, stds = np.array(usable).T
+    weights = stds**-2 / np.sum(stds**-2)
+    mean = float(weights @ values)
+    scatter = float(np.sqrt(weights @ (values - mean)**2))  # of repeats, which share their flaws
+    std = max(float(np.sum(stds**-2)**-0.5), scatter)
+    return mean, max(mean, 0.0) - SIGMAS * std, max(mean, 0.0) + SIGMAS * std
+
+
+def _straightening(chain: Chain, visible: float) -> float:
+    """
+    Return the least friction per weight, over EI, that keeps a lying DLO bent [1/m^3].
+
+    By virtual work: where a stretch from a point to one end straightens a
+    little, in proportion to its bend, the bending energy falls by EI times the
+    integral of the squared curvature, and friction takes at most mu w times the
+    path of every point.
+
+    :param visible: a bend whose points would move less than that, on average, is noise [m].
+    """
+    places = np.linspace(0, chain.length, SAMPLES + 1)
+    step = places[1]
+    curve = chain.resample(places)[:, :2]
+    most = 0.0
+    for side in (curve, curve[::-1]):
+        tangent = np.gradient(side, step, axis=0)
+        angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+        normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+        curvature = np.gradient(angle, step)
+        for first in range(0, int((1 - SHORTEST) * SAMPLES) + 1, 8):
+            turn = angle[first:] - angle[first]
+            path = np.linalg.norm(np.cumsum(turn[:, None] * normal[first:], axis=0) * step, axis=1)
+            work = float(path.sum())
+            if work > visible * len(path):
+                most = max(most, float(np.sum(curvature[first:]**2)) / work)
+    return most
+
+
+def _apart(chain: Chain) -> tuple[Floats, Floats]:
+    """Return how far apart all pairs of points of a curve are: along it and in space, (p,) [m] each."""
+    places = np.linspace(0, chain.length, SAMPLES + 1)
+    points = chain.resample(places)
+    first, second = np.triu_indices(len(points), 1)
+    return places[second] - places[first], np.linalg.norm(points[second] - points[first], axis=1)
+
+
+def _near_itself(points: Floats, places: Floats, sigma: float) -> list[int]:
+    """List the points that may touch another part of the DLO."""
+    largest = BY_NAME['self_collision'].at_hundred
+    along = np.abs(places[:, None] - places[None, :])
+    space = np.linalg.norm(points[:, None] - points[None, :], axis=2)
+    spacing = float(np.diff(places).max())
+    near = (along > np.pi * largest + spacing) & (space < 2 * largest + SIGMAS * sigma)
+    return [int(i) for i in np.flatnonzero(near.any(axis=1))]
+
+
+def _flexibility(resting: _Resting, weight: float) -> Estimate:
+    name = 'flexibility'
+    if math.isnan(weight):
+        return _nothing(name, 'the mass is to be found too, and only their ratio shows in shapes at rest')
+    load, low, high = resting.load
+    parameter = BY_NAME[name]
+    lowest, highest = parameter.at_hundred, parameter.at_zero
+    words = []
+    if resting.parts:
+        words.append(f'the balance of moments of {resting.parts} hanging part(s)')
+        lowest = weight / (high * STIFFNESS_MARGIN)
+        highest = weight / low * STIFFNESS_MARGIN if low > 0 else highest
+    if resting.hold > 0:
+        held = BY_NAME['friction'].at_hundred * weight / resting.hold * FRICTION_MARGIN
+        if lowest < held < highest:
+            highest = held
+            words.append('the bend that friction on the table can hold')
+    if not words:
+        return _nothing(name, 'nothing hangs, and nothing lies bent on the table')
+    return _scaled(name, weight / load if load > 0 else math.nan, lowest, highest,
+                   f'{" and ".join(words)}: EI from {measured(lowest, parameter.unit)}'
+                   f' to {measured(highest, parameter.unit)}')
+
+
+def _elasticity(resting: _Resting, weight: float) -> Estimate:
+    name = 'elasticity'
+    if math.isnan(weight):
+        return _nothing(name, 'the mass is to be found too, and only their ratio shows in shapes at rest')
+    stretch, low, high = resting.stretch
+    if not math.isfinite(high):
+        return _nothing(name, 'nothing hangs, and a pull along the table is not known')
+    lowest = weight / (high * STIFFNESS_MARGIN)
+    highest = weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME[name].at_zero
+    seen = low > 0
+    return _scaled(name, weight / stretch if seen else math.nan, lowest, highest,
+                   f'{"the stretch" if seen else "no measurable stretch"} of {resting.parts} hanging part(s) '
+                   f'under their weight: EA from {measured(lowest, BY_NAME[name].unit)}')
+
+
+def _friction(resting: _Resting) -> Estimate:
+    name = 'friction'
+    if resting.hold == 0:
+        return _nothing(name, 'nothing lies bent on the table')
+    load, _, highest_load = resting.load
+    if not load > 0:
+        return _nothing(name, 'it holds the DLO bent on the table, but the stiffness is not known')
+    lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
+    return _scaled(name, resting.hold / load, lowest, BY_NAME[name].at_hundred,
+                   f'the bend that the DLO keeps on the table: at least {measured(lowest, "1")}')
+
+
+def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: float) -> Estimate:
+    name = 'self_collision'
+    parameter = BY_NAME[name]
+    radii = np.geomspace(parameter.at_zero, parameter.at_hundred, RADII)
+    allowed = np.ones(RADII, bool)
+    for trial in trials:
+        for chain in (trial.initial, *(goal.chain for goal in trial.goals)):
+            along, space = _apart(chain)
+            spacing = float(np.linalg.norm(np.diff(chain.points, axis=0), axis=1).max())
+            room = space * RADIUS_MARGIN + SIGMAS * sigma
+            for k in np.flatnonzero(allowed):  # parts nearer along the DLO cannot touch, see `contact`
+                apart = along > np.pi * radii[k] + spacing
+                allowed[k] = not bool((room[apart] < 2 * radii[k]).any())
+    # A radius is allowed or not at each size; the largest allowed one bounds it.
+    largest = float(radii[np.flatnonzero(allowed).max(initial=0)])
+    levels = [] if table_height is None else [
+        level - table_height for trial in trials for level in [resting_level(trial, table_height)]
+        if level is not None and parameter.at_zero <= level - table_height <= parameter.at_hundred]
+    words = [f'no parts that are not neighbours were nearer than {2 * largest:.3g} m'] * (
+        largest < parameter.at_hundred)
+    words += ['the height of its middle above the table'] * bool(levels)
+    if not words:
+        return _nothing(name, 'nothing came near itself, and nothing lies on the table')
+    return _scaled(name, float(np.median(levels)) if levels else math.nan, parameter.at_zero, largest,
+                   '; '.join(words))

@@ -1,0 +1,160 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Excitation: which parameters a trial can tell anything about, before anything is simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Mapping, NamedTuple, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.estimate import estimate
+from dlo_calibration.noise import noise
+from dlo_calibration.parameters import BY_NAME, GRAVITY, ParameterSpace
+from dlo_calibration.trial import Trial
+
+CLEAR = 0.1  # m above the table, and the length of the hands' paths: surely not touched
+NEAR = 1.5  # largest diameters: parts that stay further apart surely do not touch
+FOLDED = 0.8  # of the distance along the DLO: no bend brings parts nearer whose distance is a larger share
+BETWEEN = 9  # chains looked at from one observed chain to the next
+SLACK = 0.9  # of the distance along the DLO: hands that are nearer do not pull it
+PULL = 4.0  # weights of the DLO that one hand, which drags and swings it, pulls with at most
+UNSEEN = 0.2  # of the noise: a smaller change is not seen
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """
+    Which free parameters the trials can tell anything about.
+
+    :param table: (T, d), False only where a trial surely does not show a parameter.
+    :param reasons: in words, for every parameter that some trial does not show.
+    """
+
+    table: NDArray[np.bool_]
+    reasons: Mapping[str, str]
+
+
+class Priors(NamedTuple):
+    """
+    What the chains alone say, as a search takes it.
+
+    `start` (nan where there is none), `lower` and `upper` are (d,) in the unit
+    cube, `rows` (T,) numbers of residuals, `excites` (T, d).
+    """
+
+    start: Floats
+    lower: Floats
+    upper: Floats
+    rows: NDArray[np.intp]
+    excites: NDArray[np.bool_]
+
+
+def priors(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Priors:
+    """Return what the chains alone say; `table_height` [m] is None where there is no table."""
+    start, lower, upper = estimate(trials, space, table_height).cube()
+    rows = frozen_array([3 * len(trial.goals) * len(trial.initial) for trial in trials], int)
+    return Priors(start, lower, upper, rows, excites(trials, space, table_height).table)
+
+
+def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Excitation:
+    """Return which free parameters each trial can show; `table_height` [m]: None without a table."""
+    sigma = noise(trials)
+    rows = []
+    for trial in trials:
+        touches = _comes_near_itself(trial)
+        shown = {
+            'friction': touches or _reaches(trial, table_height), 'self_collision': touches,
+            'elasticity': _may_stretch(trial, space, sigma),
+            'damping': any(not goal.stable for goal in trial.goals),
+            'internal_damping': any(not goal.stable for goal in trial.goals),
+            'mass': not all(p.per_weight <= (p.name in space.free) for p in BY_NAME.values())}
+        rows.append([shown.get(name, True) for name in space.free])
+    table = frozen_array(np.reshape(rows, (len(trials), space.dimension)), bool)
+    reasons = {name: REASONS[name] for name, column in zip(space.free, table.T, strict=True)
+               if not column.all()}
+    return Excitation(table, reasons)
+
+
+REASONS = {
+    'friction': 'the DLO touches neither a table nor itself',
+    'self_collision': 'parts of the DLO that are no neighbours stay apart',
+    'elasticity': 'nothing pulls hard enough for a stretch that shows in the noise',
+    'damping': 'it was observed at rest only',
+    'internal_damping': 'it was observed at rest only',
+    'mass': 'shapes show only its ratio to the stiffnesses, which are to be found too',
+}
+
+
+def _chains(trial: Trial) -> list[Floats]:
+    return [trial.initial.points, *(goal.chain.points for goal in trial.goals)]
+
+
+def _reaches(trial: Trial, table_height: float | None) -> bool:
+    """Tell whether a DLO may touch the table: where it hung low, or hands moved far."""
+    if table_height is None:
+        return False
+    lowest = min(float(points[:, 2].min()) for points in _chains(trial))
+    travel = max(float(np.linalg.norm(np.diff(hand.positions, axis=0), axis=1).sum()) for hand in trial.hands)
+    swing = 0.0 if trial.velocity is None else trial.initial.length
+    return lowest < table_height + CLEAR + travel + swing
+
+
+def _comes_near_itself(trial: Trial) -> bool:
+    """
+    Tell whether parts that are no neighbours may have touched.
+
+    Looked at are the observed chains, chains between them, and the way of each hand past them.
+    """
+    reach = NEAR * 2 * BY_NAME['self_collision'].at_hundred
+    places = trial.initial.arc_lengths()
+    along = np.abs(places[:, None] - places[None, :])
+    spacing = float(np.diff(places).max())
+    chains = _chains(trial)
+    steps = np.linspace(0, 1, BETWEEN)[:, None, None]
+    between = np.concatenate([a + steps * (b - a) for a, b in zip(chains[:-1], chains[1:], strict=True)])
+
+    def near(distance: Floats, apart: Floats) -> bool:
+        return bool(((distance < reach + spacing) & (distance < FOLDED * apart)).any())
+
+    for points in between:
+        if near(np.linalg.norm(points[:, None] - points[None, :], axis=2), along):
+            return True
+    for hand in trial.hands:
+        path = hand.positions_at(np.linspace(hand.start, hand.end, 4 * BETWEEN))
+        for points in chains:
+            offset = np.linalg.norm(path[:, None] - points[None, :], axis=2)
+            if near(offset, along[list(hand.grips)].min(axis=0)):
+                return True
+    return False
+
+
+def _may_stretch(trial: Trial, space: ParameterSpace, sigma: float) -> bool:
+    """Tell whether the DLO may have been stretched measurably, were it as elastic as the scale goes."""
+    hands, length = trial.hands, trial.initial.length
+    places = trial.initial.arc_lengths()
+    for k, hand in enumerate(hands):
+        for other in hands[k + 1:]:
+            times = np.linspace(min(hand.start, other.start), max(hand.end, other.end), 4 * BETWEEN)
+            apart = np.linalg.norm(hand.positions_at(times) - other.positions_at(times), axis=1).max()
+            if apart > SLACK * np.ptp(places[[*hand.grips, *other.grips]]):
+                return True
+    if np.isnan(sigma) or 'mass' in space.free or any(not goal.stable for goal in trial.goals):
+        return True
+    weight = space.physical({}, length)['mass'] * GRAVITY
+    return bool(PULL * weight / BY_NAME['elasticity'].at_hundred * length > UNSEEN * sigma)

@@ -1,0 +1,127 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Noise of observed points, from how rough the chains are."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.trial import Trial
+
+ORDERS = range(2, 9)  # of the differences; more do not separate curve and noise any better
+FEWEST_POINTS = 5  # of a chain that tells bending from noise
+KINK = 8.0  # times the median square: more than noise; 99.9 % of white noise in space is below
+
+
+def noise(trials: Sequence[Trial]) -> float:
+    """
+    Return the standard deviation of one coordinate of the observed points [m].
+
+    nan where no chain has five points.  Noise that is alike at neighbouring
+    points (of a tracker that fits a smooth curve) is not seen.
+    """
+    rows: dict[int, list[Floats]] = {}
+    for trial in trials:
+        chains = np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+        steps = np.linalg.norm(np.diff(chains, axis=1), axis=2).mean(axis=0)
+        # The places take up the mean of the chains' noise along the DLO; the differences lack that share.
+        seen = 3 - 1 / len(chains)
+        for order, weights in _differences(np.concatenate([[0.0], np.cumsum(steps)])).items():
+            rows.setdefault(order, []).append(_squares(weights, chains) / seen)
+    return _smallest(rows)
+
+
+def noise_of(residuals: ArrayLike, places: Floats | None = None) -> float:
+    """
+    Return the standard deviation of one coordinate of residual chains that is rough, not smooth.
+
+    :param residuals: (g, n, 3) [m] of g chains, or (n, 3) of one.
+    :param places: (n,) of the points along the DLO, any unit; None: evenly spaced.
+    :returns: [m]; nan with fewer than five points.
+    """
+    chains = np.asarray(residuals, dtype=float)
+    chains = chains.reshape(-1, *chains.shape[-2:])
+    at = np.arange(chains.shape[1], dtype=float) if places is None else np.asarray(places, dtype=float)
+    return _smallest({order: [_squares(weights, chains) / 3] for order, weights in _differences(at).items()})
+
+
+def _differences(places: Floats) -> dict[int, Floats]:
+    """
+    Return for each order k the (n - k, n) weights of differences of unit length.
+
+    Row i is the divided difference at places i to i + k: polynomials of a degree
+    below k vanish, white noise keeps its size.  A smooth curve shrinks with each
+    order as long as its waves are longer than a few spacings.
+    """
+    count = len(places)
+    weights = np.eye(count)
+    found: dict[int, Floats] = {}
+    if count < FEWEST_POINTS:
+        return found
+    for order in range(1, min(ORDERS.stop, count)):
+        widths = places[order:] - places[:-order]
+        weights = np.diff(weights, axis=0) / widths[:, None]
+        if order in ORDERS:
+            found[order] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
+    return found
+
+
+def _squares(weights: Floats, chains: Floats) -> Floats:
+    """Return the squared lengths of all differences of (g, n, 3) chains."""
+    differences = weights @ chains
+    return np.asarray(np.einsum('gij,gij->gi', differences, differences).ravel())
+
+
+def _smallest(squares: dict[int, list[Floats]]) -> float:
+    """Return the smallest root mean square of all orders, without single kinks; nan where there is none."""
+    estimates = []
+    for rows in squares.values():
+        values = np.concatenate(rows)
+        values = values[values <= KINK * np.median(values)]
+        if len(values):
+            estimates.append(values.mean())
+    return float(np.sqrt(min(estimates))) if estimates else float('nan')
+
+
+def smooth(points: Floats, places: Floats, noise: float) -> Floats:
+    """
+    Return the smoothest points that the noise allows, (n, 3) [m].
+
+    Third differences are kept small as far as the points stay within the noise
+    (Reinsch, Smoothing by Spline Functions, 1967, in the discrete form of Whittaker, 1923).
+
+    :param points: (n, 3) [m].
+    :param places: (n,) [m] along the DLO.
+    :param noise: standard deviation of a coordinate [m].
+    """
+    weights = np.eye(len(points))
+    spread = places / (places[-1] - places[0]) * (len(points) - 1)
+    for order in range(1, min(4, len(points))):
+        weights = np.diff(weights, axis=0) / (spread[order:] - spread[:-order])[:, None]
+    stiffness, modes = np.linalg.eigh(weights.T @ weights)
+    parts = modes.T @ points
+    low, high = -6.0, 8.0  # decimal logarithm of the smoothing
+    for _ in range(30):
+        middle = (low + high) / 2
+        kept = 1 / (1 + 10**middle * np.maximum(stiffness, 0))
+        missed = np.sum(((1 - kept)[:, None] * parts)**2)
+        allowed = 3 * noise**2 * np.sum((1 - kept)**2)
+        low, high = (low, middle) if missed > allowed else (middle, high)
+    kept = 1 / (1 + 10**low * np.maximum(stiffness, 0))
+    return np.asarray(modes @ (kept[:, None] * parts))

@@ -1,0 +1,63 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Shapes at rest of known rods, for tests."""
+
+import numpy as np
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.chain import Chain
+from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.trial import Goal, Trial
+
+LENGTH = 0.6
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def hung(bending, held, mass=0.03, stretching=1e4, nodes=61, length=LENGTH, seconds=6.0):
+    """
+    Return the (nodes, 3) shape at rest of a rod whose held nodes were moved from straight along x.
+
+    :param held: place that each held node is moved to, by its index [m].
+    """
+    step = 0.004
+    rod = Rod(np.full(nodes - 1, length / (nodes - 1)),
+              RodProperties(bending, stretching, mass, drag=3.0, internal_damping=0.01), step)
+    points = np.stack([np.linspace(0, length, nodes), np.zeros(nodes), np.ones(nodes)], axis=1)
+    velocities = np.zeros_like(points)
+    indices = sorted(held)
+    rod.hold(indices)
+    ways = np.array([held[i] for i in indices]) - points[indices]
+    for k in range(int(seconds / step)):
+        moving = ways if k * step < 1.0 else 0 * ways
+        velocities = rod.velocities(points, velocities, GRAVITY, moving)
+        points = points + step * velocities
+    return points
+
+
+def observed(shape, count, noise=0.0, seed=0):
+    """Return `count` of the points of a shape, with white noise [m]."""
+    chosen = shape[np.linspace(0, len(shape) - 1, count).round().astype(int)]
+    return chosen + np.random.default_rng(seed).normal(0, noise, chosen.shape)
+
+
+def trial_of(goal, grips, initial=None, stable=True, length=LENGTH):
+    """Return a trial in which hands, given by their grips, hold the goal; None in place of them: released."""
+    count = len(goal)
+    if initial is None:
+        initial = np.stack([np.linspace(0, length, count), np.zeros(count), np.ones(count)], axis=1)
+    hands = tuple(Hand(f'hand {k}', own, [0.0, 1.0], [initial[own[0]], goal[own[0]]])
+                  for k, own in enumerate(grips or [(0,)]))
+    held = tuple(hand.name for hand in hands) if grips else ()
+    return Trial('hung', Chain(initial), (Action(hands),), (Goal(Chain(goal), 3.0, stable, held),))

@@ -1,0 +1,195 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What chains alone say of the parameters: the truth is in the range, and the range is no tautology."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from resting import hung, LENGTH, observed, trial_of
+
+from dlo_calibration.chain import Chain
+from dlo_calibration.config import Options
+from dlo_calibration.estimate import estimate
+from dlo_calibration.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.trial import Goal, Trial
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get('DLO_DATA', ROOT / '../shared/data'))
+MASS = 0.03
+SPACE = ParameterSpace(mass=MASS)
+MILLIMETRE = 1e-3
+CLAMP = {0: (0, 0, 1), 1: (0.01, 0, 1)}
+
+#: EI [N m^2], EA [N], friction, radius [m] of msg_samples/README.md
+OBJECTS = {'object1': (1e-4, 300, 0.4, 0.004), 'object2': (2e-3, 800, 0.5, 0.007),
+           'object3': (1e-5, 100, 0.3, 0.0025), 'object4': (3e-4, 4, 0.6, 0.003),
+           'object5': (2e-2, 3000, 0.5, 0.01)}
+NAMES = ('flexibility', 'elasticity', 'friction', 'self_collision')
+
+
+def on_scale(name, physical):
+    return float(np.clip(BY_NAME[name].value(physical), 0, 100))
+
+
+def sample(name):
+    session = read_session(ROOT / 'msg_samples' / name)
+    options = Options.of({**Options().flat(), **session.options})
+    return session_trials(session, options)[0], ParameterSpace(mass=options.mass)
+
+
+@pytest.fixture(scope='module', params=OBJECTS)
+def known(request):
+    trials, space = sample(request.param)
+    return estimate(trials, space, 0.0), dict(zip(NAMES, OBJECTS[request.param], strict=True))
+
+
+def test_ranges_of_the_reference_objects_hold_the_truth(known):
+    estimates, truth = known
+    for name, one in estimates.parameters.items():
+        assert one.lower <= on_scale(name, truth[name]) <= one.upper, one
+
+
+def test_flexibility_of_the_reference_objects_is_near_the_truth(known):
+    estimates, truth = known
+    found = estimates.parameters['flexibility']
+    assert found.value == pytest.approx(on_scale('flexibility', truth['flexibility']), abs=10)
+    assert found.upper - found.lower < 45
+
+
+def test_radius_of_the_reference_objects_is_their_height_above_the_table(known):
+    estimates, truth = known
+    assert estimates.parameters['self_collision'].value == pytest.approx(
+        on_scale('self_collision', truth['self_collision']), abs=5)
+
+
+def test_noise_of_the_reference_objects_is_known(known):
+    assert known[0].noise == pytest.approx(MILLIMETRE, rel=0.15)
+
+
+@pytest.mark.parametrize('bending', [1e-3, 1e-2, 5e-2])
+@pytest.mark.parametrize('seed', range(5))
+def test_range_of_a_cantilever_holds_the_truth(bending, seed):
+    goal = observed(hung(bending, CLAMP), 31, MILLIMETRE, seed)
+    found = estimate([trial_of(goal, [(0, 1)])], SPACE, None).parameters['flexibility']
+    assert found.lower <= on_scale('flexibility', bending) <= found.upper
+    assert found.upper - found.lower < 60
+
+
+def test_more_stretch_is_more_elastic():
+    found = [estimate([trial_of(observed(hung(1e-4, {0: (0, 0, 1)}, 1.0, stretching), 31), [(0,)])],
+                      ParameterSpace(mass=1.0), None).parameters['elasticity'] for stretching in (60.0, 5e3)]
+    for one, truth in zip(found, (60.0, 5e3), strict=True):
+        assert one.lower <= on_scale('elasticity', truth) <= one.upper
+    assert found[0].lower > 40 and found[0].value == pytest.approx(on_scale('elasticity', 60.0), abs=15)
+    assert found[1].upper < 80 and np.isnan(found[1].value)
+
+
+def changed(trial, change):
+    goals = tuple(Goal(Chain(change(goal.chain.points)), goal.time, goal.stable, goal.held_by)
+                  for goal in trial.goals)
+    return Trial(trial.name, Chain(change(trial.initial.points)), trial.actions, goals)
+
+
+TURN = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize('change', [lambda p: p @ TURN, lambda p: p + [3, -2, 0], lambda p: p * [1, -1, 1]],
+                         ids=['turned', 'moved', 'mirrored'])
+def test_the_frame_does_not_matter(change):
+    trials, space = sample('object1')
+    before = estimate(trials, space, 0.0)
+    after = estimate([changed(trial, change) for trial in trials], space, 0.0)
+    for name, one in before.parameters.items():
+        other = after.parameters[name]
+        assert (other.value, other.lower, other.upper) == pytest.approx(
+            (one.value, one.lower, one.upper), abs=0.5, nan_ok=True)
+
+
+def test_the_order_of_the_points_does_not_matter():
+    goal = observed(hung(1e-2, CLAMP), 31, MILLIMETRE)
+    first = trial_of(goal, [(0, 1)])
+    turned = trial_of(goal[::-1], [(30, 29)], first.initial.points[::-1])
+    one, other = (estimate([trial], SPACE, None).parameters['flexibility'] for trial in (first, turned))
+    assert other.value == pytest.approx(one.value, abs=0.5)
+
+
+def test_a_heavier_dlo_of_that_shape_is_stiffer():
+    trials = [trial_of(observed(hung(1e-3, CLAMP), 31), [(0, 1)])]
+    light, heavy = (estimate(trials, ParameterSpace(mass=mass), None).parameters['flexibility']
+                    for mass in (MASS, 10 * MASS))
+    assert light.value - heavy.value == pytest.approx(100 / 4.5)
+
+
+def test_stiffness_is_not_told_where_the_mass_is_to_be_found():
+    trials = [trial_of(observed(hung(1e-3, CLAMP), 31), [(0, 1)])]
+    found = estimate(trials, ParameterSpace(free=('flexibility', 'mass')), None).parameters
+    assert (found['flexibility'].lower, found['flexibility'].upper) == (0, 100)
+    assert (found['mass'].lower, found['mass'].upper) == (0, 100)
+
+
+@pytest.mark.parametrize('count', [3, 4, 6])
+@pytest.mark.parametrize('table_height', [None, 0.0, 1.0])
+def test_few_points_give_finite_ranges(count, table_height):
+    goal = observed(hung(1e-3, CLAMP), count, MILLIMETRE)
+    lower, upper = estimate([trial_of(goal, [(0,)])], SPACE, table_height).cube()[1:]
+    assert np.isfinite([lower, upper]).all() and (lower <= upper).all()
+
+
+def test_a_moving_dlo_tells_nothing_of_its_stiffness():
+    goal = observed(hung(1e-3, CLAMP), 31)
+    found = estimate([trial_of(goal, [(0, 1)], stable=False)], SPACE, None).parameters['flexibility']
+    assert (found.lower, found.upper) == (0, 100) and np.isnan(found.value)
+
+
+def test_a_bend_on_the_table_bounds_stiffness_by_friction():
+    angle = np.linspace(0, 3, 31)
+    bent = 0.1 * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle + 0.05], axis=1)
+    found = estimate([trial_of(bent, None, bent)], SPACE, 0.0).parameters
+    assert found['flexibility'].lower > 20 and found['flexibility'].upper == 100
+    straight = np.stack([np.linspace(0, LENGTH, 31), 0 * angle, 0 * angle + 0.005], axis=1)
+    assert estimate([trial_of(straight, None, straight)], SPACE, 0.0).parameters['flexibility'].lower == 0
+
+
+def test_nearby_strands_bound_the_radius():
+    angle = np.linspace(0, np.pi, 16)
+    legs = np.linspace(0.2, 0, 12)[:-1]
+    hairpin = np.concatenate([
+        np.stack([-legs, 0 * legs, 0 * legs], axis=1),
+        0.006 * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1),
+        np.stack([-legs[::-1], 0.012 + 0 * legs, 0 * legs], axis=1)]) + [0, 0, 0.004]
+    found = estimate([trial_of(hairpin, None, hairpin)], SPACE, 0.0).parameters['self_collision']
+    assert on_scale('self_collision', 0.006) <= found.upper < on_scale('self_collision', 0.012)
+
+
+@pytest.mark.parametrize('name', ['white', 'black'])
+def test_ranges_of_hanging_wires_hold_the_published_stiffness(name):
+    file = DATA / 'hanging' / f'{name}.npz'
+    if not file.is_file():
+        pytest.skip(f'{file} is not there; DLO_DATA names the folder of measured data')
+    with np.load(file) as wire:
+        points, published = wire['points'].astype(float), wire['published_EI']
+        length, mass = float(wire['length_m']), float(wire['length_m'] * wire['mass_per_m'])
+    apart = np.array([length / 50, 0, 0])
+    trials = []
+    for repeat in points:
+        clamped = np.concatenate([[repeat[0] - apart], repeat, [repeat[-1] + apart]])
+        trials.append(trial_of(clamped, [(0, 1), (51, 52)], length=length * 52 / 50))
+    found = estimate(trials, ParameterSpace(mass=mass * 52 / 50), None).parameters['flexibility']
+    for stiffness in published:
+        assert found.lower <= on_scale('flexibility', stiffness) <= found.upper
+    assert found.upper - found.lower < 40

@@ -1,0 +1,98 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The balance of moments of hanging parts."""
+
+import numpy as np
+import pytest
+from resting import hung, LENGTH, observed
+
+from dlo_calibration.suspension import balance, hanging_parts, Part
+
+MASS = 0.03
+WEIGHT = MASS * 9.81 / LENGTH
+MILLIMETRE = 1e-3
+CLAMP = {0: (0, 0, 1), 1: (0.01, 0, 1)}  # at the left, horizontal
+
+
+def load_of(points, part, noise=MILLIMETRE):
+    return balance(points, np.linspace(0, LENGTH, len(points)), part, noise)
+
+
+@pytest.mark.parametrize('bending', [1e-3, 1e-2, 1e-1])
+def test_stiffness_of_a_cantilever(bending):
+    found = load_of(observed(hung(bending, CLAMP), 31), Part(1, 30, ('unknown', 'free')))
+    assert WEIGHT / found.load == pytest.approx(bending, rel=0.05)
+    assert found.error < 0.3 * MILLIMETRE
+
+
+@pytest.mark.parametrize('bending', [1e-4, 1e-3])
+@pytest.mark.parametrize('ends', [('pin', 'pin'), ('unknown', 'unknown')])
+def test_stiffness_of_a_loop_between_two_pins(bending, ends):
+    shape = hung(bending, {0: (0, 0, 1), 60: (0.3, 0.1, 1.05)})
+    found = load_of(observed(shape, 31), Part(0, 30, ends))
+    assert WEIGHT / found.load == pytest.approx(bending, rel=0.1)
+
+
+def test_a_hand_in_the_middle_is_a_force_of_its_own():
+    shape = hung(1e-3, {0: (0.1, 0, 1), 30: (0.3, 0, 1.1), 60: (0.5, 0, 1)})
+    found = load_of(observed(shape, 31), Part(0, 30, ('pin', 'pin'), (15,)))
+    assert WEIGHT / found.load == pytest.approx(1e-3, rel=0.1)
+
+
+def test_stretch_of_a_hanging_dlo():
+    shape = hung(1e-4, {0: (0, 0, 1)}, stretching=5.0)
+    found = load_of(observed(shape, 31), Part(0, 30, ('pin', 'free')))
+    assert WEIGHT / found.stretch == pytest.approx(5.0, rel=0.1)
+
+
+def test_std_is_how_far_noise_moves_the_result():
+    shape = hung(1e-3, {0: (0, 0, 1), 60: (0.4, 0, 1)})
+    part = Part(0, 20, ('pin', 'pin'))
+    found = [load_of(observed(shape, 21, MILLIMETRE, seed), part) for seed in range(40)]
+    loads = np.array([one.load for one in found])
+    assert np.mean([one.std for one in found]) == pytest.approx(loads.std(), rel=0.4)
+    assert np.abs(loads - WEIGHT / 1e-3).max() < 5 * loads.std()
+
+
+def test_order_and_frame_do_not_matter():
+    points = observed(hung(1e-3, CLAMP), 31)
+    part = Part(1, 30, ('unknown', 'free'))
+    found = load_of(points, part)
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    assert load_of(points @ turn + 7, part).load == pytest.approx(found.load, rel=1e-3)
+    assert load_of(points[::-1], Part(0, 29, ('free', 'unknown'))).load == pytest.approx(found.load, rel=1e-3)
+
+
+def test_too_few_points_tell_nothing():
+    assert load_of(np.eye(3), Part(0, 2, ('unknown', 'unknown'))) is None
+
+
+def parts(height, level, clamps=(), pins=(), touching=()):
+    points = np.stack([np.arange(len(height)) * 0.1, 0 * np.array(height), height], axis=1)
+    return list(hanging_parts(points, level, 0.005, clamps, pins, touching))
+
+
+def test_what_lies_ends_a_part():
+    assert parts([0, 0, .1, .2, .1, 0, 0], 0.0, pins=[3]) == [Part(2, 4, ('unknown', 'unknown'), (3,))]
+    assert parts([0, 0, .1, .2, .3], 0.0, pins=[4]) == [Part(2, 4, ('unknown', 'pin'))]
+
+
+def test_a_clamp_ends_a_part_and_belongs_to_it():
+    assert parts([1, 1, 1, 1, 1], None, clamps=[0, 1]) == [Part(1, 4, ('unknown', 'free'))]
+
+
+def test_what_nothing_holds_or_something_else_may_hold_is_left_out():
+    assert parts([1, 1, 1, 1, 1], None) == []
+    assert parts([1, 1, 1, 1, 1], None, pins=[0], touching=[3]) == []
