@@ -1,0 +1,89 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Tabulate what the chains alone say of the parameters of known objects, and of hanging wires.
+
+    python benchmark/estimates.py
+
+Nothing is simulated.  The table is printed, and written to benchmark/results/estimates.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+from dlo_calibration.config import Options  # noqa: E402
+from dlo_calibration.estimate import estimate  # noqa: E402
+from dlo_calibration.parameters import BY_NAME, ParameterSpace  # noqa: E402
+from dlo_calibration.session import read_session, session_trials  # noqa: E402
+
+DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data'))
+PROPERTIES = {'flexibility': 'EI', 'elasticity': 'EA', 'friction': 'mu', 'self_collision': 'radius'}
+
+
+def rows(name: str, path: Path, truth: dict[str, float]) -> list[str]:
+    """Return the rows of one session; `truth` has physical values by parameter."""
+    session = read_session(path)
+    options = Options.of({**Options().flat(), **(session.options or {})})
+    trials, _ = session_trials(session, options)
+    space = ParameterSpace(free=tuple(truth), mass=options.mass)
+    start = time.perf_counter()
+    found = estimate(trials, space, options.table_height if options.table else None)
+    seconds = time.perf_counter() - start
+    table = []
+    for key, one in found.parameters.items():
+        value = '-' if np.isnan(one.value) else f'{one.value:.1f}'
+        table.append(f'| {name} | {key} | {BY_NAME[key].value(truth[key]):.1f} | {value} '
+                     f'| {one.lower:.1f} to {one.upper:.1f} | {one.origin} |')
+    print(f'{name}: noise {found.noise * 1e3:.2f} mm, {seconds * 1e3:.0f} ms')
+    return table
+
+
+def main() -> None:
+    """Make the table."""
+    table = ['| object | parameter | truth | estimate | range | from |', '|' + '---|' * 6]
+    for k in range(1, 6):
+        own = json.loads((DATA / 'reference' / f'object{k}.json').read_text())['properties']
+        table += rows(f'object{k}', HERE.parent / 'msg_samples' / f'object{k}',
+                      {key: own[letter] for key, letter in PROPERTIES.items()})
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ('white', 'black'):
+            session = Path(folder) / name
+            subprocess.run([sys.executable, str(HERE / 'convert.py'), 'hanging', name, str(session)],
+                           check=True, stdout=subprocess.DEVNULL,
+                           env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
+            with np.load(DATA / 'hanging' / f'{name}.npz') as wire:
+                published = float(np.median(wire['published_EI']))
+            table += rows(f'{name} wire', session, {'flexibility': published})
+    text = '\n'.join(['# estimates', '', '`python benchmark/estimates.py`', '',
+                      'On the 0..100 scale; truth beyond it counts as its end. Of the wires, the truth is '
+                      'the median of the published stiffnesses.', '', *table, ''])
+    print(text)
+    (HERE / 'results' / 'estimates.md').write_text(text)
+
+
+if __name__ == '__main__':
+    main()
