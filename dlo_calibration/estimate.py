@@ -282,7 +282,9 @@ def _friction(resting: _Resting) -> Estimate:
     if not load > 0:
         return _nothing(name, 'it holds the DLO bent on the table, but the stiffness is not known')
     lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
-    return _scaled(name, resting.hold / load, lowest, BY_NAME[name].at_hundred,
+    most = BY_NAME[name].at_hundred
+    halfway = math.sqrt(min(most, resting.hold / load) * most)  # on the scale, from the least that holds it
+    return _scaled(name, halfway, lowest, most,
                    f'the bend that the DLO keeps on the table: at least {measured(lowest, "1")}')
 
 

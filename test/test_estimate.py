@@ -77,6 +77,12 @@ def test_radius_of_the_reference_objects_is_their_height_above_the_table(known):
         on_scale('self_collision', truth['self_collision']), abs=5)
 
 
+def test_friction_of_the_reference_objects_is_roughly_known(known):
+    estimates, truth = known
+    assert estimates.parameters['friction'].value == pytest.approx(
+        on_scale('friction', truth['friction']), abs=20)
+
+
 def test_noise_of_the_reference_objects_is_known(known):
     assert known[0].noise == pytest.approx(MILLIMETRE, rel=0.15)
 
