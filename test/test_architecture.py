@@ -48,6 +48,7 @@ ONLY = {
     'rclpy': {'options_node', 'node', 'demo'},
     'pybullet': {'bullet'},
     'numba': {'kernels'},
+    'cma': {'search'},
     'lxml': {'xml'},
     'dlo_calibration.bullet': {'engines'},
     'dlo_calibration.compiled': {'engines'},
@@ -55,7 +56,7 @@ ONLY = {
     'dlo_calibration.trial': set(ORDER) - {'search'},
 }
 
-NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'matplotlib', 'scipy.optimize')
+NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'matplotlib', 'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))
 

@@ -12,24 +12,49 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One contract for every search method, and what each promises by itself."""
+"""One contract for every search method, and what the paper's promises by itself."""
+
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-from dlo_calibration.search import Observation, SEARCHES
+from dlo_calibration.search import Hints, Observation, SEARCHES
+
+NAMES = [pytest.param(name, marks=pytest.mark.skipif(
+    name == 'cma_es' and find_spec('cma') is None, reason='the library cma is not installed'))
+    for name in SEARCHES]
+SEEDED = [name for name in NAMES if name.values != ('sequential',)]
+MEASURED = [name for name in NAMES if name.values != ('random',)]  # that use what they are told
 
 
-def bowl(points):
-    """Return what a smooth valley gives at points of the unit cube."""
-    away = np.asarray(points) - 0.3
-    return [Observation(point, float(np.linalg.norm(offset)), offset)
-            for point, offset in zip(points, away, strict=True)]
+class Problem:
+    """
+    Residuals in a curved valley of the unit cube; parameters listed in `flat` have no effect.
+
+    :param fails: the whole of it cannot be simulated.
+    """
+
+    def __init__(self, dimension, flat=(), fails=False, fails_below=-1.0):
+        generator = np.random.default_rng(dimension)
+        self.truth = generator.uniform(0.25, 0.75, dimension)
+        self.lean, self.bend = generator.normal(size=(2, 40, dimension))
+        self.noise = generator.normal(scale=0.001, size=40)
+        self.moves = np.isin(np.arange(dimension), flat, invert=True)
+        self.fails, self.fails_below = fails, fails_below
+
+    def observe(self, point):
+        if self.fails or point[0] < self.fails_below:
+            return Observation(point, float('inf'), None)
+        away = (point - self.truth) * self.moves
+        residuals = 0.1 * (self.lean @ away + 0.5 * np.sin(2 * self.bend @ away)) + self.noise
+        return Observation(point, float(np.linalg.norm(residuals)), residuals)
 
 
-def walk(name, dimension, seed, budget, limits=(1000,)):
+def walk(name, dimension, seed, budget, limits=(1000,), problem=None, hints=None):
     """Ask and tell until the budget is spent, at most `limits` at a time, in turn."""
-    search = SEARCHES[name](dimension, seed)
+    problem = problem or Problem(dimension)
+    search = SEARCHES[name](dimension, seed, hints)
     asked = np.zeros((0, dimension))
     turn = 0
     while len(asked) < budget:
@@ -38,44 +63,129 @@ def walk(name, dimension, seed, budget, limits=(1000,)):
         if not len(points):
             break
         assert len(points) <= limit
-        search.tell(bowl(points))
+        search.tell([problem.observe(point) for point in points])
         asked = np.concatenate([asked, points])
         turn += 1
     return search, asked
 
 
-@pytest.mark.parametrize('dimension', [1, 4, 7])
-@pytest.mark.parametrize('name', SEARCHES)
+@pytest.mark.parametrize('dimension', [1, 2, 4, 8])
+@pytest.mark.parametrize('name', NAMES)
 def test_points_lie_in_the_unit_cube_and_stay_within_the_limit(name, dimension):
-    search, asked = walk(name, dimension, 3, 40, limits=(1, 7, 100))
+    search, asked = walk(name, dimension, 3, 60, limits=(1, 7, 100))
     assert asked.shape[1] == dimension
-    assert 1 <= len(asked) <= 40
+    assert 1 <= len(asked) <= 60
     assert asked.min() >= 0
     assert asked.max() <= 1
     assert isinstance(search.stop_reason, str)
-    assert bool(search.stop_reason) == (len(asked) < 40)
+    assert search.stop_reason or len(asked) == 60
 
 
-@pytest.mark.parametrize('name', SEARCHES)
+@pytest.mark.parametrize('name', NAMES)
+def test_it_has_a_result_after_the_smallest_budgets(name):
+    for budget in range(1, 6):
+        search, asked = walk(name, 3, 1, budget)
+        assert len(asked) == budget
+        assert (search.best == asked).all(axis=1).any()
+
+
+@pytest.mark.parametrize('name', NAMES)
 def test_the_same_seed_gives_the_same_points_bit_for_bit(name):
-    first, again, other = (walk(name, 4, seed, 50)[1] for seed in (5, 5, 6))
-    assert first.tobytes() == again.tobytes()
-    assert first.tobytes() != other.tobytes()
+    np.random.seed(0)
+    first = walk(name, 4, 5, 50)[1]
+    np.random.seed(1)
+    assert first.tobytes() == walk(name, 4, 5, 50)[1].tobytes()
 
 
-@pytest.mark.parametrize('name', SEARCHES)
-def test_it_is_known_by_its_name(name):
-    assert SEARCHES[name](2, 0).name == name
+@pytest.mark.parametrize('name', SEEDED)
+def test_another_seed_gives_other_points(name):
+    assert walk(name, 4, 5, 50)[1].tobytes() != walk(name, 4, 6, 50)[1].tobytes()
 
 
-@pytest.mark.parametrize('name', SEARCHES)
-def test_failed_evaluations_are_taken(name):
+@pytest.mark.parametrize('name', NAMES)
+def test_numpys_shared_random_numbers_are_left_alone(name):
+    np.random.seed(3)
+    wanted = np.random.random()
+    np.random.seed(3)
+    walk(name, 2, 5, 30)
+    assert np.random.random() == wanted
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_points_do_not_depend_on_how_the_asking_is_split(name):
+    whole = walk(name, 4, 9, 60)
+    split = walk(name, 4, 9, 60, limits=(1, 2, 13))
+    assert whole[1].tobytes() == split[1].tobytes()
+    assert (whole[0].best == split[0].best).all()
+    assert whole[0].stop_reason == split[0].stop_reason
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_it_is_known_by_its_name_and_has_no_result_at_first(name):
     search = SEARCHES[name](2, 0)
-    points = search.ask(10)
-    search.tell([Observation(point, float('inf'), None) for point in points])
-    following = search.ask(10)
-    assert following.shape[1:] == (2,)
-    assert np.isfinite(following).all()
+    assert (search.name, search.best, search.stop_reason) == (name, None, '')
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_a_search_of_which_all_fails_goes_on_to_look_elsewhere(name):
+    search, asked = walk(name, 2, 0, 40, problem=Problem(2, fails=True))
+    assert np.isfinite(asked).all()
+    assert len(np.unique(asked, axis=0)) == len(asked) > 10
+    assert search.best is None
+
+
+@pytest.mark.parametrize('name', MEASURED)
+def test_what_fails_is_avoided_and_the_optimum_beside_it_found(name):
+    problem = Problem(2)
+    problem.fails_below = problem.truth[0] - 0.01
+    search = walk(name, 2, 1, 150, problem=problem)[0]
+    assert search.best == pytest.approx(problem.truth, abs=0.01)
+
+
+@pytest.mark.parametrize('dimension', [1, 2, 3])
+@pytest.mark.parametrize('name', MEASURED)
+def test_the_optimum_of_a_curved_valley_is_found(name, dimension):
+    problem = Problem(dimension)
+    for seed in range(3):
+        search, asked = walk(name, dimension, seed, 300, problem=problem)
+        assert search.best == pytest.approx(problem.truth, abs=0.01)
+        assert search.stop_reason
+        assert len(asked) < 300
+        assert search.ask(10).shape == (0, dimension)
+
+
+@pytest.mark.parametrize('name', MEASURED)
+def test_a_parameter_without_effect_does_not_disturb_the_others(name):
+    problem = Problem(3, flat=(1,))
+    search = walk(name, 3, 1, 300, problem=problem)[0]
+    assert search.best[[0, 2]] == pytest.approx(problem.truth[[0, 2]], abs=0.01)
+
+
+@pytest.mark.parametrize('name', MEASURED)
+def test_where_nothing_has_an_effect_it_ends(name):
+    search, asked = walk(name, 2, 1, 300, problem=Problem(2, flat=(0, 1)))
+    assert search.stop_reason
+    assert len(asked) < 100
+
+
+@pytest.mark.parametrize('name', MEASURED)
+def test_a_hint_is_where_it_begins(name):
+    hints = Hints([0.7, np.nan], [0.6, 0.0], [0.8, 1.0], (40,), [[True, True]])
+    asked = walk(name, 2, 1, 20, hints=hints)[1]
+    assert np.abs(asked[:6, 0] - 0.7).min() < 0.35
+    again = walk(name, 2, 1, 20)[1]
+    assert asked.tobytes() != again.tobytes()
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_hints_that_tell_nothing_change_nothing(name):
+    assert walk(name, 3, 1, 30)[1].tobytes() == walk(name, 3, 1, 30, hints=Hints.none(3))[1].tobytes()
+
+
+def test_hints_tell_which_parameters_are_excited():
+    assert Hints.none(2).excited.tolist() == [True, True]
+    hints = Hints([0.5] * 3, [0] * 3, [1] * 3, (4, 5), [[True, False, False], [True, False, True]])
+    assert hints.excited.tolist() == [True, False, True]
 
 
 def test_random_points_do_not_depend_on_how_the_asking_is_split():

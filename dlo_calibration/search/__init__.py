@@ -18,12 +18,15 @@ from __future__ import annotations
 
 from typing import Callable, Mapping
 
-from dlo_calibration.search.protocol import Observation, Search
+from dlo_calibration.search.cma_es import CmaEs
+from dlo_calibration.search.least_squares import Fit, LeastSquares
+from dlo_calibration.search.protocol import Hints, Observation, Search
 from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.search.sequential import Sequential
 
-__all__ = ['SEARCHES', 'Observation', 'RandomSearch', 'Search']
+__all__ = ['CmaEs', 'Fit', 'Hints', 'LeastSquares', 'Observation', 'RandomSearch', 'Search', 'SEARCHES',
+           'Sequential']
 
-#: name -> constructor(dimension, seed)
-SEARCHES: Mapping[str, Callable[[int, int], Search]] = {
-    RandomSearch.name: RandomSearch,
-}
+#: name -> constructor(dimension, seed, hints=None)
+SEARCHES: Mapping[str, Callable[..., Search]] = {
+    search.name: search for search in (LeastSquares, RandomSearch, CmaEs, Sequential)}

@@ -19,7 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, Sequence
 
-from dlo_calibration.chain import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.chain import Floats, frozen_array
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,44 @@ class Observation:
     point: Floats
     score: float
     residuals: Floats | None
+
+
+@dataclass(frozen=True)
+class Hints:
+    """
+    What is known before the first evaluation, in the unit cube of d parameters.
+
+    :param start: (d,) estimate; nan where there is none.
+    :param lower: (d,) lower end of the range of that estimate; 0 where there is none.
+    :param upper: (d,) upper end; 1 where there is none.
+    :param rows: how many residuals each of T trials has, in order; empty where
+        that is not known.
+    :param excites: (T, d) True where a trial excites a parameter.
+    """
+
+    start: Floats
+    lower: Floats
+    upper: Floats
+    rows: tuple[int, ...]
+    excites: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        for name in ('start', 'lower', 'upper'):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+        excites = np.array(self.excites, dtype=np.bool_)
+        excites.flags.writeable = False
+        object.__setattr__(self, 'excites', excites)
+
+    @classmethod
+    def none(cls, dimension: int) -> Hints:
+        """Return hints that tell nothing."""
+        blank = np.zeros(dimension)
+        return cls(blank * np.nan, blank, blank + 1, (), np.zeros((0, dimension), dtype=np.bool_))
+
+    @property
+    def excited(self) -> NDArray[np.bool_]:
+        """(d,) True for the parameters that some trial excites; all where nothing is known."""
+        return self.excites.any(axis=0) if len(self.excites) else np.ones(len(self.start), dtype=np.bool_)
 
 
 class Search(Protocol):
@@ -57,3 +98,7 @@ class Search(Protocol):
     @property
     def stop_reason(self) -> str:
         """Why it finished, in words; empty while it has not."""
+
+    @property
+    def best(self) -> Floats | None:
+        """The (d,) point that the method calls its result; None while no evaluation succeeded."""

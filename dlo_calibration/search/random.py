@@ -21,7 +21,7 @@ from typing import Sequence
 import numpy as np
 
 from dlo_calibration.chain import Floats
-from dlo_calibration.search.protocol import Observation
+from dlo_calibration.search.protocol import Hints, Observation
 
 BATCH = 50  # points asked at a time: enough to keep many processes busy, few enough to hold their residuals
 
@@ -32,11 +32,13 @@ class RandomSearch:
 
     :param dimension: number of parameters.
     :param seed: of the `numpy.random.Generator`.
+    :param hints: not used.
     """
 
     name = 'random'
 
-    def __init__(self, dimension: int, seed: int) -> None:
+    def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
+        self._lowest: Observation | None = None
         self._dimension = dimension
         self._generator = np.random.default_rng(seed)
 
@@ -45,9 +47,17 @@ class RandomSearch:
         return self._generator.random((min(limit, BATCH), self._dimension))
 
     def tell(self, observations: Sequence[Observation]) -> None:
-        """Ignore the results."""
+        """Remember the best; what was found changes nothing else."""
+        for one in observations:
+            if np.isfinite(one.score) and (self._lowest is None or one.score < self._lowest.score):
+                self._lowest = one
 
     @property
     def stop_reason(self) -> str:
         """Never finishes by itself."""
         return ''
+
+    @property
+    def best(self) -> Floats | None:
+        """The (d,) point of lowest score."""
+        return None if self._lowest is None else self._lowest.point

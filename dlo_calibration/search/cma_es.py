@@ -1,0 +1,90 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The covariance matrix adaptation evolution strategy, of the library `cma`: needs the score alone."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.errors import InputError
+from dlo_calibration.search.plan import Plan, PlannedSearch
+from dlo_calibration.search.protocol import Hints, Observation
+
+FIRST_SIGMA = 0.25  # a quarter of the range: the optimum is within two of them from the centre
+DONE_SIGMA = 1e-3  # standard deviation of the points asked at which it has converged
+
+
+class CmaEs(PlannedSearch):
+    """
+    Minimise the score with a population whose covariance adapts (Hansen, arXiv:1604.00772).
+
+    Only the order of the scores counts.  One batch is one generation.
+
+    :param dimension: number of parameters.
+    :param seed: of the `numpy.random.Generator`.
+    :param hints: their start is the first mean.
+    """
+
+    name = 'cma_es'
+
+    def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
+        super().__init__(dimension)
+        self._seed = seed
+        self._hints = Hints.none(dimension) if hints is None else hints
+        self._lowest: Observation | None = None
+
+    @property
+    def best(self) -> Floats | None:
+        """The (d,) point of lowest score."""
+        return None if self._lowest is None else self._lowest.point
+
+    def tell(self, observations: Sequence[Observation]) -> None:
+        """Take the results of the last `ask`."""
+        for one in observations:
+            if np.isfinite(one.score) and (self._lowest is None or one.score < self._lowest.score):
+                self._lowest = one
+        super().tell(observations)
+
+    def _plan(self) -> Plan:
+        try:
+            import cma
+        except ImportError as error:
+            raise InputError('search cma_es', 'the Python library cma is not installed', 'it',
+                             'install it (pip install cma), or choose another search') from error
+        generator = np.random.default_rng(self._seed)
+        start = np.where(np.isnan(self._hints.start), 0.5, np.clip(self._hints.start, 0, 1))
+        # Its own random numbers and no seed of its own: it would set the one that all of NumPy shares.
+        # No tolerance in units of the score.
+        strategy = cma.CMAEvolutionStrategy(start, FIRST_SIGMA, {
+            'bounds': [0, 1], 'seed': np.nan, 'randn': lambda *shape: generator.standard_normal(shape),
+            'verbose': -9, 'tolx': DONE_SIGMA, 'tolfun': 0, 'tolfunhist': 0, 'maxiter': np.inf,
+            'maxstd': np.inf})
+        while not strategy.stop():
+            points = np.clip(strategy.ask(), 0.0, 1.0)
+            observations = yield points
+            scores = np.array([one.score for one in observations])
+            good = np.isfinite(scores)
+            if not good.any():
+                continue  # there is nothing to learn, and the next ones are drawn likewise
+            scores[~good] = 2 * np.abs(scores[good]).max() + 1  # the last in order, which is all that counts
+            strategy.tell(list(points), scores.tolist())
+        if 'tolx' in strategy.stop():
+            return f'converged: new points differ by less than {DONE_SIGMA * 100:g} of 100'
+        if 'tolflatfitness' in strategy.stop():
+            return 'stopped: the scores no longer differ'
+        return f'stopped: {", ".join(sorted(strategy.stop()))}'

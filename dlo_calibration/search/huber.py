@@ -1,0 +1,59 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A robust cost of residuals: quadratic for most of them, linear for the few that lie far out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_calibration.chain import Floats
+
+MEDIAN_OF_NORMAL = 0.6745  # median of |x| for a standard normal x
+EFFICIENT = 1.345  # standard deviations where Huber's loss keeps 95 % of the efficiency of least squares
+SMALLEST_SHARE = 0.1  # of the root mean square: most residuals may be nearly zero without being the measure
+
+
+@dataclass(frozen=True)
+class Huber:
+    """
+    Huber's loss (Huber 1964, Annals of Mathematical Statistics 35, 73-101).
+
+    :param scale: [m] where it turns from quadratic to linear.
+    """
+
+    scale: float
+
+    @classmethod
+    def of(cls, residuals: Floats) -> Huber:
+        """Return the loss whose scale suits the spread of (m,) residuals [m]."""
+        if not residuals.size:
+            return cls(1.0)
+        spread = float(np.median(np.abs(residuals))) / MEDIAN_OF_NORMAL
+        floor = SMALLEST_SHARE * float(np.sqrt(np.mean(residuals ** 2)))
+        return cls(max(EFFICIENT * spread, floor, 1e-12))
+
+    def cost(self, residuals: Floats | None) -> float:
+        """Return the cost [m^2] of (m,) residuals [m]; infinite where there are none."""
+        if residuals is None:
+            return float('inf')
+        size = np.abs(residuals)
+        inside = np.minimum(size, self.scale)
+        return float(np.sum(inside * (size - inside / 2)))
+
+    def roots(self, residuals: Floats) -> Floats:
+        """Return the square roots (m,) of the weights with which least squares has the same gradient."""
+        return np.sqrt(self.scale / np.maximum(np.abs(residuals), self.scale))

@@ -1,0 +1,400 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bounded robust least squares from several start points: few evaluations, from what the residuals tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.search.huber import Huber
+from dlo_calibration.search.plan import Plan, PlannedSearch
+from dlo_calibration.search.protocol import Hints, Observation
+
+STARTS_PER_PARAMETER = 2
+FEWEST_STARTS = 8
+LARGEST_STEP = 0.03  # of a finite difference
+SMALLEST_STEP = 0.005  # below it, contacts that come and go are all that one sees
+STEP_OVER_ROUGHNESS = 10.0  # a column's change over what the model could not predict
+FIRST_RADIUS = 0.25
+LARGEST_RADIUS = 0.5
+SPECULATIVE = 1 / 4  # radius of the second point tried, in radii of the first
+DONE_STEP = 1e-3  # converged where the next step is not longer, in any parameter
+DONE_GAIN = 1e-4  # or would not lower the cost by more than this share of it
+SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
+RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
+SAME_PLACE = 0.03  # two descents that end that near to each other found the same minimum
+SAME_COST = 1e-3  # or that near in cost, as a share
+MOST_DESCENTS = 4
+BEYOND = (0.1, 0.5, 0.9)  # where the parameter known worst is tried, too: minima lie side by side along it
+LARGEST_FOLLOW = 0.1
+MOST_ITERATIONS = 25
+DAMPING = 1e-4  # of the largest column's square: enough that a parameter without effect stays
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    What is known at the point of lowest cost.
+
+    :param point: (d,) in the unit cube.
+    :param residuals: (m,) [m] there.
+    :param jacobian: (m, d) their derivative by the parameters [m per unit cube,
+        that is per 100 of the 0..100 scale], by finite differences of
+        SMALLEST_STEP to LARGEST_STEP beside the point.
+    :param cost: of `loss` [m^2].
+    :param loss: its scale came from the residuals.
+    :param measured: (d,) True where a parameter had a measurable effect; the
+        others kept the value that they had.
+    """
+
+    point: Floats
+    residuals: Floats
+    jacobian: Floats
+    cost: float
+    loss: Huber
+    measured: NDArray[np.bool_]
+
+
+@dataclass
+class _Descent:
+    """Where a descent stands; the Jacobian was measured at `origin`, and updated since by some steps."""
+
+    point: Floats
+    residuals: Floats
+    loss: Huber
+    jacobian: Floats
+    radius: float = FIRST_RADIUS
+    roughness: float = np.inf  # [m] root mean square of what the last step's model did not predict
+    origin: Floats | None = None
+    updates: int = 0  # of the Jacobian, by steps after which it was not good
+    ended: str = ''
+
+    @property
+    def cost(self) -> float:
+        return self.loss.cost(self.residuals)
+
+    @property
+    def known_here(self) -> bool:
+        """Whether the Jacobian was measured no further away than its own differences reach."""
+        return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= LARGEST_STEP)
+
+    def move(self, observation: Observation) -> None:
+        assert observation.residuals is not None
+        self.point, self.residuals = observation.point, observation.residuals
+        loss = Huber.of(self.residuals)
+        if loss.scale < self.loss.scale:  # never larger again, so that costs of one descent compare
+            self.loss = loss
+
+    def measured(self) -> NDArray[np.bool_]:
+        """(d,) True where going from 0 to 1 changes the residuals by more than their own size."""
+        size = np.linalg.norm(self.jacobian, axis=0)
+        noise = self.loss.scale
+        return size > max(noise, 1e-9 * float(size.max(initial=0.0)), 1e-12)
+
+
+def lower(one: Floats, other: Floats) -> bool:
+    """Return whether the first residuals [m] cost less, by the narrower of the two losses."""
+    loss = min(Huber.of(one), Huber.of(other), key=lambda candidate: candidate.scale)
+    return loss.cost(one) < loss.cost(other)
+
+
+class LeastSquares(PlannedSearch):
+    """
+    Minimise the robust sum of squared residuals within the unit cube.
+
+    Start points fill the space; from the best of them, Gauss-Newton steps
+    within a box (Nocedal and Wright, Numerical Optimization, 2nd ed., 10.3)
+    whose Jacobian comes from finite differences and, between them, from
+    Broyden's update (ibid., 11.1).  Other starts are followed until the lowest
+    minimum was found twice.
+
+    :param dimension: number of parameters.
+    :param seed: of the start points.
+    :param hints: their start is tried first.
+    """
+
+    name = 'least_squares'
+
+    def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
+        super().__init__(dimension)
+        self._seed = seed
+        self._hints = Hints.none(dimension) if hints is None else hints
+        self._lowest: Observation | None = None
+        self._fit: Fit | None = None
+
+    @property
+    def best(self) -> Floats | None:
+        """The (d,) point of lowest robust cost; its difference score may not be the lowest."""
+        return None if self._lowest is None else self._lowest.point
+
+    @property
+    def fit(self) -> Fit | None:
+        """What is known at the minimum; None while no descent has ended."""
+        return self._fit
+
+    def tell(self, observations: Sequence[Observation]) -> None:
+        """Take the results of the last `ask`."""
+        for one in observations:
+            if one.residuals is not None and (
+                    self._lowest is None or self._lowest.residuals is None
+                    or lower(one.residuals, self._lowest.residuals)):
+                self._lowest = one
+        super().tell(observations)
+
+    def _plan(self) -> Plan:
+        starts = self._in_turn((yield from self._starts()))
+        best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
+        found, descents, looked = 1, 1, False  # `found`: times that the best minimum was reached
+        while found < 2 and descents < MOST_DESCENTS:
+            if best.ended and not looked:
+                beyond = yield from self._look_beyond(best)
+                starts = [one for one in beyond if best.loss.cost(one.residuals) < best.cost] + starts
+                looked = True
+            starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
+            if not starts:
+                break
+            descent = yield from self._descend(self._begin(starts.pop(0)), best, starts)
+            descents += 1
+            same, better = self._same(descent, best), lower(descent.residuals, best.residuals)
+            found = found + 1 if same else 1 if better else found
+            if better:
+                best = descent
+            if best.ended:
+                self._keep(best)
+        if not best.ended:
+            best = yield from self._descend(best, None, ())
+            self._keep(best)
+        return best.ended + (f'; reached from {found} starts' if found > 1 else '')
+
+    def _begin(self, start: Observation) -> _Descent:
+        assert start.residuals is not None
+        return _Descent(start.point, start.residuals, Huber.of(start.residuals),
+                        np.zeros((len(start.residuals), self._dimension)))
+
+    def _look_beyond(self, here: _Descent) -> Generator[Floats, Sequence[Observation], list[Observation]]:
+        """Ask for points far away in the parameter that is known worst; the others follow by the model."""
+        free = np.flatnonzero(here.measured())
+        if not len(free):
+            return []
+        matrix = here.loss.roots(here.residuals)[:, None] * here.jacobian[:, free]
+        covariance = np.linalg.pinv(matrix.T @ matrix)
+        worst = int(np.argmax(np.diag(covariance)))
+        follow = covariance[:, worst] / covariance[worst, worst]
+        value = here.point[free[worst]]
+        points = []
+        for target in sorted(BEYOND, key=lambda target: -abs(target - value))[:2]:
+            point = here.point.copy()
+            point[free] += np.clip(follow * (target - value), -LARGEST_FOLLOW, LARGEST_FOLLOW)
+            point[free[worst]] = target
+            points.append(np.clip(point, 0.0, 1.0))
+        observations = yield np.array(points)
+        return sorted((one for one in observations if one.residuals is not None),
+                      key=lambda one: here.loss.cost(one.residuals))
+
+    def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
+        """Ask for start points until one can be simulated."""
+        from scipy.stats import qmc
+
+        # Powers of two keep a Sobol sequence balanced.
+        count = 2 ** int(np.ceil(np.log2(max(FEWEST_STARTS, STARTS_PER_PARAMETER * self._dimension))))
+        sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
+        hint = np.clip(self._hints.start, 0, 1)
+        while True:
+            points = sobol.random(count)
+            # Half of them keep to the estimate: where it is good it saves a lot, where it is wrong not all.
+            points[::2] = np.where(np.isnan(hint), points[::2], hint)
+            points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
+            observations = yield np.unique(points, axis=0)
+            starts = [one for one in observations if one.residuals is not None]
+            if starts:
+                return starts
+
+    def _in_turn(self, starts: Sequence[Observation]) -> list[Observation]:
+        """Sort start points by their cost, all by the loss of the best."""
+        loss = min((Huber.of(one.residuals) for one in starts if one.residuals is not None),
+                   key=lambda candidate: candidate.scale)
+        return sorted(starts, key=lambda one: loss.cost(one.residuals))
+
+    def _same(self, one: _Descent, other: _Descent) -> bool:
+        loss = min(one.loss, other.loss, key=lambda candidate: candidate.scale)
+        costs = loss.cost(one.residuals), loss.cost(other.residuals)
+        both = one.measured() & other.measured()
+        apart = np.abs(one.point - other.point)[both].max(initial=0.0)
+        return bool(apart < SAME_PLACE or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
+
+    def _keep(self, descent: _Descent) -> None:
+        self._fit = Fit(descent.point, descent.residuals, descent.jacobian, descent.cost,
+                        descent.loss, descent.measured())
+
+    def _descend(self, here: _Descent, known: _Descent | None, rivals: Sequence[Observation]
+                 ) -> Generator[Floats, Sequence[Observation], _Descent]:
+        """
+        Go down from where a descent stands.
+
+        Leave it, with nothing in `ended`, where it leads to the `known` minimum or to
+        a higher one, or is slow while one of its `rivals` costs hardly more.
+        """
+        slow = 0
+        if here.origin is None:
+            yield from self._measure(here, np.flatnonzero(self._hints.excited))
+        for _ in range(MOST_ITERATIONS):
+            step = self._step(here, np.inf)
+            gain = here.cost - self._predicted(here, step)
+            length = float(np.abs(step).max(initial=0.0))
+            if known is not None and self._leads_nowhere(here, step, known):
+                return here
+            if length <= DONE_STEP or gain <= DONE_GAIN * here.cost:
+                if here.known_here:
+                    here.ended = (
+                        f'converged: the next step would change no parameter by more than '
+                        f'{DONE_STEP * 100:g} of 100' if length <= DONE_STEP else
+                        f'converged: the next step would lower the cost by less than {DONE_GAIN * 100:g} %')
+                    return here
+                yield from self._measure(here, np.flatnonzero(here.measured()))
+                continue
+            before = here.cost
+            reach = min(length, here.radius)
+            moved = yield from self._try(here)
+            gained = 1 - here.cost / before
+            if here.known_here and reach < LARGEST_STEP and gained <= DONE_GAIN:
+                here.ended = f'converged: the last step lowered the cost by less than {DONE_GAIN * 100:g} %'
+                return here
+            slow = slow + 1 if gained < SLOW_GAIN else 0
+            if slow and known is not None and known.loss.cost(here.residuals) > 2 * known.cost:
+                return here
+            if slow > 1 and any(here.loss.cost(one.residuals) < RIVAL * here.cost for one in rivals):
+                return here
+            if not moved and here.updates:
+                yield from self._measure(here, np.flatnonzero(here.measured()))
+        here.ended = f'stopped after {MOST_ITERATIONS} steps'
+        return here
+
+    def _leads_nowhere(self, here: _Descent, step: Floats, known: _Descent) -> bool:
+        """Return whether a descent nears the known minimum, or flattens out above it."""
+        target = here.point + step
+        both = here.measured() & known.measured()
+        near = np.abs(target - known.point)[both].max(initial=0.0) < SAME_PLACE and (
+            np.abs(here.point - known.point)[both].max(initial=0.0) < 2 * SAME_PLACE)
+        higher = known.loss.cost(here.residuals) > known.cost
+        flat = float(np.abs(step).max(initial=0.0)) < SAME_PLACE / 3
+        return bool(higher and (near or flat))
+
+    def _step(self, here: _Descent, radius: float) -> Floats:
+        """Return the (d,) step to the lowest point of the model within the cube and the radius."""
+        from scipy.optimize import lsq_linear
+
+        roots = here.loss.roots(here.residuals)
+        free = here.measured()
+        step = np.zeros(self._dimension)
+        least = np.maximum(-here.point, -radius)[free]
+        most = np.minimum(1 - here.point, radius)[free]
+        movable = most - least > 1e-12
+        columns = np.flatnonzero(free)[movable]
+        if not len(columns):
+            return step
+        matrix = roots[:, None] * here.jacobian[:, columns]
+        # Only the product matters to the solution: d rows in place of m.
+        upper, rest = _reduced(matrix, -roots * here.residuals)
+        damping = np.sqrt(DAMPING) * np.linalg.norm(matrix, axis=0).max() * 1e-2
+        upper = np.concatenate([upper, damping * np.eye(len(columns))])
+        rest = np.concatenate([rest, np.zeros(len(columns))])
+        solution = lsq_linear(upper, rest, (least[movable], most[movable]), method='bvls')
+        step[columns] = solution.x
+        return step
+
+    def _predicted(self, here: _Descent, step: Floats) -> float:
+        return here.loss.cost(here.residuals + here.jacobian @ step)
+
+    def _try(self, here: _Descent) -> Generator[Floats, Sequence[Observation], bool]:
+        """Try the step within the radius and a shorter one; move to the better if it costs less."""
+        steps = [self._step(here, here.radius)]
+        shorter = self._step(here, here.radius * SPECULATIVE)
+        if np.abs(steps[0] - shorter).max() > 0.1 * np.abs(steps[0]).max():
+            steps.append(shorter)
+        observations = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
+        costs = [here.loss.cost(one.residuals) for one in observations]
+        gains = [here.cost - self._predicted(here, step) for step in steps]
+        chosen = int(np.argmin(costs))
+        base, before = here.point, here.residuals
+        moved = costs[chosen] < here.cost
+        good = moved and here.cost - costs[chosen] > 0.5 * gains[chosen]
+        length = float(np.abs(steps[chosen]).max())
+        if moved:
+            here.move(observations[chosen])
+            if good and chosen == 0:
+                here.radius = min(max(here.radius, 2 * length), LARGEST_RADIUS)
+            elif chosen == 1 or not good:
+                here.radius = max(length, here.radius * SPECULATIVE) if good else length / 2
+        else:
+            here.radius = min(float(np.abs(step).max()) for step in steps) / 4
+        # The shortest first: the longest one's update then holds exactly.
+        for one in sorted(observations, key=lambda seen: float(np.linalg.norm(seen.point - base))):
+            self._learn(here, one, base, before)
+        here.updates = here.updates + 1 if moved else here.updates
+        return moved
+
+    def _learn(self, here: _Descent, one: Observation, base: Floats, before: Floats) -> None:
+        """Update the Jacobian so that it predicts what a step gave (Broyden's rank-one update)."""
+        if one.residuals is None:
+            return
+        step = one.point - base
+        square = float(step @ step)
+        if square < 1e-16:
+            return
+        surprise = one.residuals - before - here.jacobian @ step
+        here.roughness = float(np.sqrt(np.mean(surprise ** 2)))
+        here.jacobian = here.jacobian + np.outer(surprise, step / square)
+
+    def _measure(self, here: _Descent, columns: NDArray[np.intp]
+                 ) -> Generator[Floats, Sequence[Observation], None]:
+        """Measure columns of the Jacobian by finite differences at once; move where one costs less."""
+        here.origin, here.updates = here.point, 0
+        if not len(columns):
+            return
+        sizes = self._difference_steps(here)
+        sizes = np.where(here.point + sizes > 1, -sizes, sizes)
+        seen = list((yield here.point + np.diag(sizes)[columns]))
+        failed = [at for at, one in enumerate(seen) if one.residuals is None]
+        if failed:
+            sizes = np.where((here.point - sizes >= 0) & (here.point - sizes <= 1), -sizes, sizes / 4)
+            for at, one in zip(failed, (yield here.point + np.diag(sizes)[columns[failed]]), strict=True):
+                seen[at] = one
+        here.jacobian = here.jacobian.copy()
+        for k, one in zip(columns, seen, strict=True):
+            here.jacobian[:, k] = 0.0 if one.residuals is None else (
+                one.residuals - here.residuals) / (one.point[k] - here.point[k])
+        nearest = min(seen, key=lambda one: here.loss.cost(one.residuals))
+        if here.loss.cost(nearest.residuals) < here.cost:
+            here.move(nearest)
+
+    def _difference_steps(self, here: _Descent) -> Floats:
+        """Return the (d,) steps of finite differences: shorter as the model gets better."""
+        change = np.sqrt(np.mean(here.jacobian ** 2, axis=0))  # [m] root mean square, from 0 to 1
+        with np.errstate(divide='ignore', invalid='ignore'):
+            sizes = STEP_OVER_ROUGHNESS * here.roughness / change
+        return np.clip(np.where(np.isfinite(sizes), sizes, LARGEST_STEP), SMALLEST_STEP, LARGEST_STEP)
+
+
+def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:
+    """Return (d, d) and (d,) that have the same least-squares solution as (m, d) and (m,)."""
+    if len(matrix) <= matrix.shape[1]:
+        return matrix, right
+    q, r = np.linalg.qr(matrix)
+    return r, q.T @ right

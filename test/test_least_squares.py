@@ -1,0 +1,139 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What least squares promises by itself: few evaluations, the lower minimum, no pull by outliers, a Jacobian."""
+
+import numpy as np
+import pytest
+
+from dlo_calibration.search import Hints, LeastSquares, Observation
+from dlo_calibration.search.huber import Huber
+
+TRUTH = np.array([0.62, 0.35, 0.5])
+
+
+def valley(point, outliers=0.0, roughness=0.0, flat=()):
+    """Return residuals [m] of a smooth nonlinear problem in three parameters with 1 mm of noise."""
+    generator = np.random.default_rng(4)
+    lean, bend = generator.normal(size=(2, 90, 3))
+    away = np.where(np.isin(np.arange(3), flat), 0.0, point - TRUTH)
+    residuals = 0.1 * (lean @ away + 0.5 * np.sin(2 * bend @ away)) + generator.normal(scale=0.001, size=90)
+    residuals *= 1 + roughness * np.sin(1e5 * (1 + point.sum()) * np.arange(90))
+    residuals[::15] += outliers
+    return residuals
+
+
+def two_minima(point):
+    """Return residuals [m] with a minimum near (0.2, 0.3), and a wider, worse one near (0.8, 0.3)."""
+    x, y = point
+    dip = np.exp(-((x - 0.2) / 0.15) ** 2)
+    return np.array([0.1 * (x - 0.8) * (1 - dip), 0.02 * (1 - dip), 0.1 * (y - 0.3) * (1 + x), 0.001])
+
+
+def solve(residuals_at, seed=1, budget=150, dimension=3, hints=None):
+    """Return the search after it has ended or spent its budget, and the points asked."""
+    search = LeastSquares(dimension, seed, hints)
+    asked = []
+    while len(asked) < budget:
+        points = search.ask(budget - len(asked))
+        if not len(points):
+            break
+        search.tell([Observation(p, float(np.linalg.norm(residuals_at(p))), residuals_at(p)) for p in points])
+        asked.extend(points)
+    return search, np.array(asked)
+
+
+@pytest.mark.parametrize('roughness', [0.0, 1e-4, 1e-2])
+def test_it_converges_in_few_evaluations_to_one_point_from_any_seed(roughness):
+    found, counts = [], []
+    for seed in range(8):
+        search, asked = solve(lambda point: valley(point, roughness=roughness), seed)
+        assert search.stop_reason.startswith('converged')
+        found.append(search.best)
+        counts.append(len(asked))
+    assert np.ptp(found, axis=0).max() < 0.003
+    assert np.mean(found, axis=0) == pytest.approx(TRUTH, abs=0.003)
+    assert np.median(counts) < 45
+
+
+def test_outliers_do_not_pull():
+    found = solve(lambda point: valley(point, outliers=0.3))[0].best
+    assert found == pytest.approx(TRUTH, abs=0.005)
+
+
+def test_the_lower_of_two_minima_is_found_from_any_seed():
+    for seed in range(12):
+        search = solve(two_minima, seed, dimension=2)[0]
+        assert search.best == pytest.approx([0.2, 0.3], abs=0.02), f'seed {seed}'
+
+
+def test_a_parameter_without_effect_keeps_the_value_of_its_start():
+    hints = Hints([np.nan, 0.4, np.nan], [0.0] * 3, [1.0] * 3, (90,), [[True, False, True]])
+    search = solve(lambda point: valley(point, flat=(1,)), hints=hints)[0]
+    assert search.best[1] == 0.4
+    assert search.fit.measured.tolist() == [True, False, True]
+    assert not search.fit.jacobian[:, 1].any()
+
+
+def test_a_parameter_that_only_trembles_is_not_moved_by_chance():
+    def trembling(point):
+        residuals = valley(point, flat=(1,))
+        return residuals + 1e-7 * np.sin(1e6 * point[1] * np.arange(90))
+
+    search, asked = solve(trembling)
+    assert not search.fit.measured[1]
+    assert search.best[1] in asked[:8, 1]
+
+
+def test_the_fit_tells_residuals_cost_and_jacobian_at_the_optimum():
+    search = solve(valley)[0]
+    fit = search.fit
+    assert fit.point == pytest.approx(search.best, abs=1e-3)
+    assert (fit.residuals == valley(fit.point)).all()
+    assert fit.cost == fit.loss.cost(fit.residuals)
+    for k, step in enumerate(np.eye(3) * 1e-5):
+        column = (valley(fit.point + step) - valley(fit.point - step)) / 2e-5
+        assert fit.jacobian[:, k] == pytest.approx(column, abs=0.1 * np.abs(column).max())
+
+
+def test_there_is_no_fit_before_a_descent_has_ended():
+    search = solve(valley, budget=9)[0]
+    assert search.fit is None
+    assert search.best is not None
+
+
+def test_the_first_point_asked_keeps_to_the_estimate_and_others_do_not():
+    hints = Hints([0.9, np.nan, 0.1], [0.8, 0, 0], [1, 1, 0.2], (90,), [[True] * 3])
+    asked = LeastSquares(3, 1, hints).ask(100)
+    kept = (asked[:, [0, 2]] == [0.9, 0.1]).all(axis=1)
+    assert 0 < kept.sum() < len(asked)
+    wrong = Hints([0.1, np.nan, np.nan], [0, 0, 0], [0.2, 1, 1], (90,), [[True] * 3])
+    assert solve(valley, hints=wrong)[0].best == pytest.approx(TRUTH, abs=0.005)
+
+
+def test_an_optimum_on_the_border_is_found():
+    search = solve(lambda point: valley(point * [0.5, 1, 1]))[0]  # its minimum is at 1.24
+    assert search.best[0] == 1.0
+    assert search.stop_reason.startswith('converged')
+
+
+def test_hubers_loss_is_quadratic_then_linear():
+    loss = Huber(2.0)
+    assert loss.cost(np.array([1.0])) == 0.5
+    assert loss.cost(np.array([5.0])) == pytest.approx(2 * (5 - 1))
+    assert loss.cost(None) == np.inf
+    assert loss.roots(np.array([1.0, -8.0])) == pytest.approx([1.0, 0.5])
+    normal = np.random.default_rng(1).normal(scale=0.002, size=4000)
+    assert Huber.of(normal).scale == pytest.approx(1.345 * 0.002, rel=0.05)
+    assert Huber.of(np.zeros(4)).scale > 0
