@@ -29,7 +29,10 @@ from dlo_calibration.search.protocol import Hints, Observation
 
 STARTS_PER_PARAMETER = 2
 FEWEST_STARTS = 8
-LARGEST_STEP = 0.03  # of a finite difference
+FIRST_STEP = 0.03  # of a finite difference
+LARGEST_STEP = 0.2
+VISIBLE = 0.2  # share of the loss's scale by which a finite difference is to change the residuals
+NEAR = 0.03  # a Jacobian measured no further away than that counts as measured here
 SMALLEST_STEP = 0.005  # below it, contacts that come and go are all that one sees
 STEP_OVER_ROUGHNESS = 10.0  # a column's change over what the model could not predict
 FIRST_RADIUS = 0.25
@@ -37,13 +40,16 @@ LARGEST_RADIUS = 0.5
 SPECULATIVE = 1 / 4  # radius of the second point tried, in radii of the first
 DONE_STEP = 1e-3  # converged where the next step is not longer, in any parameter
 DONE_GAIN = 1e-4  # or would not lower the cost by more than this share of it
+NOISE_GAIN = 0.1
 SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
 RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
 SAME_PLACE = 0.03  # two descents that end that near to each other found the same minimum
 SAME_COST = 1e-3  # or that near in cost, as a share
-MOST_DESCENTS = 4
-BEYOND = (0.1, 0.5, 0.9)  # where the parameter known worst is tried, too: minima lie side by side along it
-LARGEST_FOLLOW = 0.1
+MOST_DESCENTS = 3
+BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too,
+BESIDE = 0.1  # unless it is that near
+WORTH_A_LOOK = 0.02  # share of the cost that such a place promises to save
+REACH = 0.1
 MOST_ITERATIONS = 25
 DAMPING = 1e-4  # of the largest column's square: enough that a parameter without effect stays
 
@@ -81,7 +87,7 @@ class _Descent:
     loss: Huber
     jacobian: Floats
     radius: float = FIRST_RADIUS
-    roughness: float = np.inf  # [m] root mean square of what the last step's model did not predict
+    roughness: float = 0.0  # [m] root mean square of what the last step's model did not predict
     origin: Floats | None = None
     updates: int = 0  # of the Jacobian, by steps after which it was not good
     ended: str = ''
@@ -93,7 +99,7 @@ class _Descent:
     @property
     def known_here(self) -> bool:
         """Whether the Jacobian was measured no further away than its own differences reach."""
-        return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= LARGEST_STEP)
+        return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
 
     def move(self, observation: Observation) -> None:
         assert observation.residuals is not None
@@ -136,6 +142,8 @@ class LeastSquares(PlannedSearch):
         super().__init__(dimension)
         self._seed = seed
         self._hints = Hints.none(dimension) if hints is None else hints
+        # Contacts that come and go make columns too large, never too small.
+        self._least_effect = np.full(dimension, np.inf)  # [m] root mean square, from 0 to 1
         self._lowest: Observation | None = None
         self._fit: Fit | None = None
 
@@ -161,19 +169,21 @@ class LeastSquares(PlannedSearch):
     def _plan(self) -> Plan:
         starts = self._in_turn((yield from self._starts()))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
+        beyond: list[_Descent] = []
         found, descents, looked = 1, 1, False  # `found`: times that the best minimum was reached
         while found < 2 and descents < MOST_DESCENTS:
             if best.ended and not looked:
                 beyond = yield from self._look_beyond(best)
-                starts = [one for one in beyond if best.loss.cost(one.residuals) < best.cost] + starts
                 looked = True
             starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
-            if not starts:
+            if not (beyond or starts):
                 break
-            descent = yield from self._descend(self._begin(starts.pop(0)), best, starts)
-            descents += 1
+            independent = not beyond
+            begun = beyond.pop() if beyond else self._begin(starts.pop(0))
+            descent = yield from self._descend(begun, best, starts)
+            descents += independent
             same, better = self._same(descent, best), lower(descent.residuals, best.residuals)
-            found = found + 1 if same else 1 if better else found
+            found = found + independent if same else 1 if better else found
             if better:
                 best = descent
             if best.ended:
@@ -188,25 +198,28 @@ class LeastSquares(PlannedSearch):
         return _Descent(start.point, start.residuals, Huber.of(start.residuals),
                         np.zeros((len(start.residuals), self._dimension)))
 
-    def _look_beyond(self, here: _Descent) -> Generator[Floats, Sequence[Observation], list[Observation]]:
-        """Ask for points far away in the parameter that is known worst; the others follow by the model."""
+    def _look_beyond(self, here: _Descent) -> Generator[Floats, Sequence[Observation], list[_Descent]]:
+        """
+        Look along the whole range of the parameter of least effect: minima lie side by side there.
+
+        :returns: the best place there, if it promises a lower cost.
+        """
         free = np.flatnonzero(here.measured())
         if not len(free):
             return []
-        matrix = here.loss.roots(here.residuals)[:, None] * here.jacobian[:, free]
-        covariance = np.linalg.pinv(matrix.T @ matrix)
-        worst = int(np.argmax(np.diag(covariance)))
-        follow = covariance[:, worst] / covariance[worst, worst]
-        value = here.point[free[worst]]
-        points = []
-        for target in sorted(BEYOND, key=lambda target: -abs(target - value))[:2]:
-            point = here.point.copy()
-            point[free] += np.clip(follow * (target - value), -LARGEST_FOLLOW, LARGEST_FOLLOW)
-            point[free[worst]] = target
-            points.append(np.clip(point, 0.0, 1.0))
-        observations = yield np.array(points)
-        return sorted((one for one in observations if one.residuals is not None),
-                      key=lambda one: here.loss.cost(one.residuals))
+        weakest = free[np.argmin(self._least_effect[free])]
+        targets = np.array([value for value in BEYOND if abs(value - here.point[weakest]) > BESIDE])
+        points = np.tile(here.point, (len(targets), 1))
+        points[:, weakest] = targets
+        observations = yield points
+        found = []
+        for one in observations:
+            if one.residuals is not None:
+                there = _Descent(one.point, one.residuals, here.loss, here.jacobian, NEAR, origin=here.origin)
+                predicted = self._predicted(there, self._step(there, REACH))
+                found.append((min(predicted, there.cost), there))
+        found.sort(key=lambda pair: pair[0])
+        return [there for predicted, there in found[:1] if predicted < (1 - WORTH_A_LOOK) * here.cost]
 
     def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
         """Ask for start points until one can be simulated."""
@@ -260,7 +273,8 @@ class LeastSquares(PlannedSearch):
             length = float(np.abs(step).max(initial=0.0))
             if known is not None and self._leads_nowhere(here, step, known):
                 return here
-            if length <= DONE_STEP or gain <= DONE_GAIN * here.cost:
+            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.scale, 0.03))
+            if length <= DONE_STEP or gain <= visible * here.cost:
                 if here.known_here:
                     here.ended = (
                         f'converged: the next step would change no parameter by more than '
@@ -273,7 +287,7 @@ class LeastSquares(PlannedSearch):
             reach = min(length, here.radius)
             moved = yield from self._try(here)
             gained = 1 - here.cost / before
-            if here.known_here and reach < LARGEST_STEP and gained <= DONE_GAIN:
+            if here.known_here and reach < NEAR and gained <= visible:
                 here.ended = f'converged: the last step lowered the cost by less than {DONE_GAIN * 100:g} %'
                 return here
             slow = slow + 1 if gained < SLOW_GAIN else 0
@@ -366,30 +380,38 @@ class LeastSquares(PlannedSearch):
                  ) -> Generator[Floats, Sequence[Observation], None]:
         """Measure columns of the Jacobian by finite differences at once; move where one costs less."""
         here.origin, here.updates = here.point, 0
-        if not len(columns):
-            return
-        sizes = self._difference_steps(here)
-        sizes = np.where(here.point + sizes > 1, -sizes, sizes)
-        seen = list((yield here.point + np.diag(sizes)[columns]))
-        failed = [at for at, one in enumerate(seen) if one.residuals is None]
-        if failed:
-            sizes = np.where((here.point - sizes >= 0) & (here.point - sizes <= 1), -sizes, sizes / 4)
-            for at, one in zip(failed, (yield here.point + np.diag(sizes)[columns[failed]]), strict=True):
-                seen[at] = one
         here.jacobian = here.jacobian.copy()
-        for k, one in zip(columns, seen, strict=True):
-            here.jacobian[:, k] = 0.0 if one.residuals is None else (
-                one.residuals - here.residuals) / (one.point[k] - here.point[k])
-        nearest = min(seen, key=lambda one: here.loss.cost(one.residuals))
-        if here.loss.cost(nearest.residuals) < here.cost:
+        sizes = self._difference_steps(here)
+        seen = yield from self._differences(here, columns, sizes)
+        effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
+        self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
+        nearest = min(seen, key=lambda one: here.loss.cost(one.residuals), default=None)
+        if nearest is not None and here.loss.cost(nearest.residuals) < here.cost:
             here.move(nearest)
 
+    def _differences(self, here: _Descent, columns: NDArray[np.intp], sizes: Floats
+                     ) -> Generator[Floats, Sequence[Observation], list[Observation]]:
+        """Set columns of the Jacobian from steps of those sizes; the other way, where one fails."""
+        seen: list[Observation] = []
+        for _ in range(2):
+            if not len(columns):
+                break
+            sizes = np.where((here.point + sizes > 1) | (here.point + sizes < 0), -sizes, sizes)
+            told = yield np.clip(here.point + np.diag(sizes)[columns], 0.0, 1.0)
+            for k, one in zip(columns, told, strict=True):
+                here.jacobian[:, k] = 0.0 if one.residuals is None else (
+                    one.residuals - here.residuals) / (one.point[k] - here.point[k])
+            seen.extend(told)
+            columns = columns[[one.residuals is None for one in told]]
+            sizes = -sizes / 2
+        return seen
+
     def _difference_steps(self, here: _Descent) -> Floats:
-        """Return the (d,) steps of finite differences: shorter as the model gets better."""
-        change = np.sqrt(np.mean(here.jacobian ** 2, axis=0))  # [m] root mean square, from 0 to 1
-        with np.errstate(divide='ignore', invalid='ignore'):
-            sizes = STEP_OVER_ROUGHNESS * here.roughness / change
-        return np.clip(np.where(np.isfinite(sizes), sizes, LARGEST_STEP), SMALLEST_STEP, LARGEST_STEP)
+        """Return the (d,) steps of finite differences that change the residuals visibly."""
+        if not here.jacobian.any():
+            return np.full(self._dimension, FIRST_STEP)
+        wanted = min(max(VISIBLE * here.loss.scale, STEP_OVER_ROUGHNESS * here.roughness), here.loss.scale)
+        return np.clip(wanted / self._least_effect, SMALLEST_STEP, LARGEST_STEP)
 
 
 def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:
