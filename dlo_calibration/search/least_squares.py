@@ -45,7 +45,7 @@ SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
 RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
 SAME_PLACE = 0.03  # two descents that end that near to each other found the same minimum
 SAME_COST = 1e-3  # or that near in cost, as a share
-MOST_DESCENTS = 3
+MOST_CHECKS = 2  # other starts followed once a minimum has been found
 BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too,
 BESIDE = 0.1  # unless it is that near
 WORTH_A_LOOK = 0.02  # share of the cost that such a place promises to save
@@ -100,6 +100,10 @@ class _Descent:
     def known_here(self) -> bool:
         """Whether the Jacobian was measured no further away than its own differences reach."""
         return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
+
+    def rivals(self, starts: Sequence[Observation]) -> bool:
+        """Whether one of the starts costs hardly more than it does here."""
+        return any(self.loss.cost(one.residuals) < RIVAL * self.cost for one in starts)
 
     def move(self, observation: Observation) -> None:
         assert observation.residuals is not None
@@ -170,27 +174,29 @@ class LeastSquares(PlannedSearch):
         starts = self._in_turn((yield from self._starts()))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[_Descent] = []
-        found, descents, looked = 1, 1, False  # `found`: times that the best minimum was reached
-        while found < 2 and descents < MOST_DESCENTS:
-            if best.ended and not looked:
-                beyond = yield from self._look_beyond(best)
-                looked = True
+        found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
+        while found < 2 and checks < MOST_CHECKS:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
+            if not best.ended and not best.rivals(starts):
+                best = yield from self._descend(best, None, ())
+            if best.ended:
+                self._keep(best)
+                if not looked:
+                    beyond = yield from self._look_beyond(best)
+                    looked = True
             if not (beyond or starts):
                 break
             independent = not beyond
             begun = beyond.pop() if beyond else self._begin(starts.pop(0))
+            checks += independent and bool(best.ended)
             descent = yield from self._descend(begun, best, starts)
-            descents += independent
             same, better = self._same(descent, best), lower(descent.residuals, best.residuals)
             found = found + independent if same else 1 if better else found
             if better:
                 best = descent
-            if best.ended:
-                self._keep(best)
         if not best.ended:
             best = yield from self._descend(best, None, ())
-            self._keep(best)
+        self._keep(best)
         return best.ended + (f'; reached from {found} starts' if found > 1 else '')
 
     def _begin(self, start: Observation) -> _Descent:
@@ -293,7 +299,7 @@ class LeastSquares(PlannedSearch):
             slow = slow + 1 if gained < SLOW_GAIN else 0
             if slow and known is not None and known.loss.cost(here.residuals) > 2 * known.cost:
                 return here
-            if slow > 1 and any(here.loss.cost(one.residuals) < RIVAL * here.cost for one in rivals):
+            if slow > 1 and here.rivals(rivals):
                 return here
             if not moved and here.updates:
                 yield from self._measure(here, np.flatnonzero(here.measured()))
@@ -411,7 +417,9 @@ class LeastSquares(PlannedSearch):
         if not here.jacobian.any():
             return np.full(self._dimension, FIRST_STEP)
         wanted = min(max(VISIBLE * here.loss.scale, STEP_OVER_ROUGHNESS * here.roughness), here.loss.scale)
-        return np.clip(wanted / self._least_effect, SMALLEST_STEP, LARGEST_STEP)
+        # Only a parameter that is weak beside the others is moved far.
+        most = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
+        return np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP)
 
 
 def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:
