@@ -93,7 +93,7 @@ def confirmed_with(result: CalibrationResult, options: Options, make_simulator: 
 
     Whatever the confirming engine does, the result is not lost.
     """
-    if options.engine != AUTO:
+    if options.engine != AUTO or result.engine == CONFIRMING:
         return result
     begun = time.monotonic()
     try:

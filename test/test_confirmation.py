@@ -153,6 +153,16 @@ def test_a_second_engine_that_cannot_be_made_does_not_lose_the_result():
     assert 'no pybullet' in calibrate_with(toy_trials(1), OPTIONS, make).warnings[-1]
 
 
+def test_pybullet_is_not_made_again_to_confirm_itself():
+    asked = []
+
+    class Bullet(ToySimulator):
+        name = 'bullet'
+
+    calibrate_with(toy_trials(1), OPTIONS, lambda options: asked.append(options) or Bullet())
+    assert len(asked) == 1
+
+
 def test_a_stopped_search_is_confirmed_too():
     count = []
     result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy(0.001)), count.append,

@@ -84,8 +84,8 @@ def test_without_numba_the_compiled_engine_is_refused(without_numba):
     with pytest.raises(InputError) as refusal:
         make_simulator(Options(engine='compiled'))
     assert str(refusal.value) == (
-        'engine compiled: got a Python where numba is not installed, expected an installed numba; pip install '
-        'numba, or apt install python3-numba; or use engine bullet or auto')
+        'engine compiled: got a Python where numba is not installed, expected an installed numba; pip '
+        'install numba, or apt install python3-numba; or use engine bullet or auto')
 
 
 def test_a_numba_that_does_not_fit_is_not_called_missing(monkeypatch, notices):
