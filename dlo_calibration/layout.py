@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dlo_calibration.action import Hand
 from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
 from dlo_calibration.errors import InputError
+from dlo_calibration.noise import noise, smooth
 from dlo_calibration.trial import Trial
 
 RESTING_BAND = 0.006  # m; points of a resting chain are that near to its lowest one
@@ -58,9 +59,12 @@ class Layout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 
+        The initial chain is smoothed as far as the noise of the trial's chains
+        goes: noise makes a chain longer, and bends a stiff one as nothing real does.
+
         :raises InputError: where more points are gripped than there can be nodes.
         """
-        initial = trial.initial
+        initial = _without_noise(trial)
         point_places = initial.arc_lengths()
         grips = sorted({grip for hand in trial.hands for grip in hand.grips})
         fixed = np.unique(np.concatenate([[0.0], point_places[grips], point_places[-1:]]))
@@ -73,6 +77,15 @@ class Layout:
             interpolation_matrix(point_places, places) @ trial.velocity
         return cls(frozen_array(places), frozen_array(initial.resample(places)), frozen_array(velocities),
                    frozen_array(observe), frozen_array(point_places))
+
+
+def _without_noise(trial: Trial) -> Chain:
+    """Return the initial chain, smoothed."""
+    sigma = noise([trial])
+    if not sigma > 0:
+        return trial.initial
+    points = smooth(trial.initial.points, trial.initial.arc_lengths(), sigma)
+    return replace(trial.initial, points=points)
 
 
 def spread_places(fixed: Floats, count: int) -> Floats:

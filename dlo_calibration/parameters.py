@@ -71,7 +71,7 @@ class Parameter:
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**-1.0, 10**-5.5, 50.0,
               'how easily the DLO bends', per_weight=True),
-    Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e1, 30.0,
+    Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e0, 25.0,
               'how easily the DLO stretches', per_weight=True),
     Parameter('friction', 'Coulomb friction coefficient', '1', 10**-2.0, 10**0.3, 70.0,
               'friction of the DLO on the table and on itself'),

@@ -28,7 +28,7 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 ORDER = (
     # pure NumPy and SciPy
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
-    'layout', 'noise', 'suspension', 'estimate', 'excitation',
+    'noise', 'layout', 'suspension', 'estimate', 'excitation',
     'search', 'confirmation', 'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',

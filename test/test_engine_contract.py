@@ -27,9 +27,10 @@ from scipy.optimize import brentq
 
 from dlo_calibration import Action, Chain, Goal, Hand, PARAMETERS, ParameterSpace, SimulationError, Trial
 from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.compiled import CompiledSimulator
 
 #: Each takes what `BulletSimulator` takes, but a scene.
-FACTORIES = (BulletSimulator,)
+FACTORIES = (BulletSimulator, CompiledSimulator)
 
 GRAVITY = 9.81
 TIME_STEP = 0.004
