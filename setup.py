@@ -52,6 +52,7 @@ setup(
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.
     install_requires=[
+        'cma>=3.3',
         'lxml>=5.2',
         'matplotlib>=3.6',
         'mcap>=1.6',
@@ -64,6 +65,8 @@ setup(
         'scipy>=1.11',
     ],
     extras_require={
+        # For simulation on several machines.
+        'distributed': ['distributed>=2023.12'],
         # On a machine with ROS 2 Jazzy these come from its own packages.
         'ros': [
             'ros-jazzy-common-interfaces',
@@ -73,6 +76,7 @@ setup(
         'test': [
             'colcon-core',
             'colcon-ros',
+            'distributed>=2023.12',
             'hypothesis>=6.98',
             'mcap-ros2-support>=0.6',
             'mypy>=1.14',

@@ -281,6 +281,9 @@ class BulletSimulator:
         self._obstacles = _obstacles(scene) if scene else ()
         self._world: _World | None = None
 
+    def prepare(self) -> None:
+        """Need nothing that copies could share."""
+
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """
         Simulate a trial with physical parameters by name (SI units).

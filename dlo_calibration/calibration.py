@@ -17,9 +17,13 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
+import copy
 from dataclasses import dataclass, replace
+import threading
 import time
 from typing import Callable, Iterator, Mapping, Sequence
+import uuid
+import weakref
 
 import numpy as np
 
@@ -31,7 +35,7 @@ from dlo_calibration.score import PointErrors, residuals, TrialScore
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Rollout, Simulator
 from dlo_calibration.trial import Trial
-from dlo_calibration.uncertainty import spread_of_best, Uncertainty
+from dlo_calibration.uncertainty import matters_below, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
 
@@ -44,11 +48,13 @@ class Evaluation:
     :param index: 0, 1, ... in the order asked.
     :param point: (d,) in the unit cube.
     :param values: free parameters on the 0..100 scale.
-    :param scores: difference score of each trial; empty where it failed.
-    :param errors: over all goal points; None where it failed.
+    :param scores: difference score of each trial, NaN of one that was skipped; empty where it failed.
+    :param errors: over all goal points; None where it failed or was abandoned.
     :param residuals: (m,) [m]; kept for the best evaluation only.
     :param unsettled: names of trials that never came to rest.
     :param failure: why it failed; empty where it did not.
+    :param skipped: number of trials that were not simulated any more: one before
+        them failed, or the evaluation was abandoned, as its score was too high already.
     """
 
     index: int
@@ -59,10 +65,22 @@ class Evaluation:
     residuals: Floats | None = None
     unsettled: tuple[str, ...] = ()
     failure: str = ''
+    skipped: int = 0
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether trials were skipped because the score was too high already."""
+        return self.skipped > 0 and not self.failure
 
     @property
     def score(self) -> float:
-        """Average difference score over the trials [cm]; infinite where it failed."""
+        """
+        Average difference score over the trials [cm]; infinite where it failed.
+
+        Where it was abandoned, a lower bound: no score is less than 0.
+        """
+        if self.abandoned:
+            return float(np.mean(np.nan_to_num(self.scores, nan=0.0)))
         return float(np.mean(self.scores)) if self.scores else float('inf')
 
 
@@ -125,7 +143,7 @@ class CalibrationResult:
     @property
     def simulations(self) -> int:
         """Rollouts that were simulated."""
-        return len(self.evaluations) * len(self.trials)
+        return sum(len(self.trials) - evaluation.skipped for evaluation in self.evaluations)
 
     def physical(self) -> dict[str, float]:
         """Every parameter's physical value in SI units, for a rope like the observed one."""
@@ -141,7 +159,7 @@ class Evaluator:
     """
     Tries parameter sets on trials.
 
-    It is pickled to worker processes: see `Simulator`.
+    It is pickled to worker processes and copied for worker threads: see `Simulator`.
     """
 
     def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
@@ -151,39 +169,73 @@ class Evaluator:
         self._length = mean_length(trials)
         self._scores = tuple(TrialScore(trial) for trial in trials)
 
-    def simulate(self, values: Mapping[str, float],
-                 should_stop: Callable[[], bool] = lambda: False) -> list[Rollout]:
+    def __copy__(self) -> Evaluator:
+        """Return one with a simulator of its own."""
+        return Evaluator(self.trials, self.space, copy.copy(self.simulator))
+
+    def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
         """Simulate every trial with free parameters on the 0..100 scale."""
         physical = self.space.physical(values, self._length)
-        rollouts = []
-        for trial in self.trials:
-            if should_stop():
-                raise CancelledError
-            rollouts.append(self.simulator.simulate(trial, physical))
-        return rollouts
+        return [self.simulator.simulate(trial, physical) for trial in self.trials]
 
-    def evaluate(self, index: int, point: Floats,
-                 should_stop: Callable[[], bool] = lambda: False) -> Evaluation:
+    def evaluate(self, index: int, point: Floats, should_stop: Callable[[], bool] = lambda: False,
+                 limits: Limits | None = None) -> Evaluation:
         """
         Try a (d,) point of the unit cube on every trial.
 
+        :param limits: None: every trial is simulated, whatever the others gave.
         :raises CancelledError: as soon as `should_stop` says so, between trials.
         """
         point = frozen_array(point)
-        blank = Evaluation(index, point, self.space.values(point))
-        try:
-            rollouts = self.simulate(blank.values, should_stop)
-        except SimulationError as error:
-            return replace(blank, failure=str(error))
-        residual = np.concatenate([residuals(trial, rollout.chains)
-                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
-        return replace(
-            blank,
-            scores=tuple(score(rollout.chains)
-                         for score, rollout in zip(self._scores, rollouts, strict=True)),
-            errors=PointErrors.of(residual), residuals=frozen_array(residual),
-            unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
-                            if not all(rollout.settled)))
+        evaluation = Evaluation(index, point, self.space.values(point))
+        physical = self.space.physical(evaluation.values, self._length)
+        scores = np.full(len(self.trials), np.nan)
+        rollouts: dict[int, Rollout] = {}
+        for k in range(len(self.trials)) if limits is None else limits.order:
+            if should_stop():
+                raise CancelledError
+            left = len(self.trials) - len(rollouts) - 1
+            try:
+                rollouts[k] = self.simulator.simulate(self.trials[k], physical)
+            except SimulationError as error:
+                return replace(evaluation, failure=str(error), skipped=left)
+            scores[k] = self._scores[k](rollouts[k].chains)
+            evaluation = replace(
+                evaluation, scores=tuple(float(score) for score in scores), skipped=left,
+                unsettled=tuple(trial.name for j, trial in enumerate(self.trials)
+                                if j in rollouts and not all(rollouts[j].settled)))
+            if left and limits is not None and evaluation.score > limits.score:
+                return evaluation
+        residual = np.concatenate([residuals(trial, rollouts[j].chains)
+                                   for j, trial in enumerate(self.trials)])
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """
+    When evaluations are abandoned.
+
+    :param score: as soon as the score cannot be this low [cm] any more.
+    :param order: indices of the trials in the order to simulate them.
+    """
+
+    score: float
+    order: tuple[int, ...]
+
+    @classmethod
+    def of(cls, search: Search, evaluations: Sequence[Evaluation], budget: int) -> Limits | None:
+        """
+        Return what neither the search nor the result can tell from no limits; None: nothing is.
+
+        Trials that scored high so far come first, as they decide soonest.
+        """
+        complete = [one for one in evaluations if one.scores and not one.skipped]
+        score = max(search.limit, matters_below([one.score for one in complete], budget))
+        if not np.isfinite(score):
+            return None
+        mean = np.mean([one.scores for one in complete], axis=0)
+        return cls(score, tuple(int(k) for k in np.argsort(-mean, kind='stable')))
 
 
 def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, search: Search, *,
@@ -213,15 +265,17 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
                          'record an initial chain, an action and a goal chain first')
     started = clock()
     evaluator = Evaluator(trials, space, simulator)
+    key = uuid.uuid4().hex  # of this calibration, on whichever machines
     kept: list[Evaluation] = []
     best: Evaluation | None = None
     stopped = False
     while len(kept) < budget and not stopped:
+        limits = Limits.of(search, kept, budget)  # known before it is asked: the same for any executor
         points = search.ask(budget - len(kept))
         if not len(points):
             break
         batch: list[Evaluation] = []
-        for evaluation in _evaluations(evaluator, len(kept), points, should_stop, executor):
+        for evaluation in _evaluations(evaluator, len(kept), points, limits, should_stop, executor, key):
             batch.append(evaluation)
             if best is None or evaluation.score < best.score:
                 best = evaluation
@@ -315,19 +369,19 @@ def _warnings(best: Evaluation, kept: Sequence[Evaluation]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _evaluations(evaluator: Evaluator, first: int, points: Floats, should_stop: Callable[[], bool],
-                 executor: Executor | None) -> Iterator[Evaluation]:
+def _evaluations(evaluator: Evaluator, first: int, points: Floats, limits: Limits | None,
+                 should_stop: Callable[[], bool], executor: Executor | None,
+                 key: str) -> Iterator[Evaluation]:
     """Evaluate points in order; end early, without a word, when asked to stop."""
     if executor is None:
         for k, point in enumerate(points):
             try:
-                yield evaluator.evaluate(first + k, point, should_stop)
+                yield evaluator.evaluate(first + k, point, should_stop, limits)
             except CancelledError:
                 return
         return
-    key = f'{id(evaluator)}-{time.monotonic_ns()}'
     futures: list[Future[Evaluation]] = [
-        executor.submit(_evaluate_elsewhere, key, evaluator, first + k, point)
+        executor.submit(_evaluate_elsewhere, key, evaluator, first + k, point, limits)
         for k, point in enumerate(points)]
     try:
         for future in futures:
@@ -350,14 +404,29 @@ def _wait(future: Future[Evaluation]) -> None:
         pass
 
 
-_evaluator_here: dict[str, Evaluator] = {}  # the one of the calibration under way, in a worker
+class _Here(threading.local):
+    """
+    What a worker's thread keeps: the evaluator of the calibration under way.
+
+    Its simulator is closed when another calibration begins, or the thread ends.
+    """
+
+    key = ''
+    evaluator: Evaluator
+    forget: Callable[[], object] = staticmethod(lambda: None)
+
+    def of(self, key: str, evaluator: Evaluator) -> Evaluator:
+        if key != self.key:
+            self.forget()
+            self.key, self.evaluator = key, copy.copy(evaluator)
+            self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
+        return self.evaluator
 
 
-def _evaluate_elsewhere(key: str, evaluator: Evaluator, index: int, point: Floats) -> Evaluation:
-    """Evaluate in a worker, whose simulator stays as long as the calibration is the same."""
-    if key not in _evaluator_here:
-        for old in _evaluator_here.values():
-            old.simulator.close()
-        _evaluator_here.clear()
-        _evaluator_here[key] = evaluator
-    return _evaluator_here[key].evaluate(index, point)
+_here = _Here()
+
+
+def _evaluate_elsewhere(key: str, evaluator: Evaluator, index: int, point: Floats,
+                        limits: Limits | None) -> Evaluation:
+    """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
+    return _here.of(key, evaluator).evaluate(index, point, limits=limits)

@@ -218,7 +218,8 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     with StopFlag() as stop:
         with SearchBar(found.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
             try:
-                result = calibrate_with(trials, found.options, make_simulator, bar.take, stop)
+                result = calibrate_with(trials, found.options, make_simulator, bar.take, stop,
+                                        lambda text: _note(f'warning: {text}'))
             except SimulationError:
                 if not stop():
                     raise

@@ -142,6 +142,9 @@ class CompiledSimulator:
         self._rope: CompiledRope | None = None
         self._known: dict[int, tuple[Trial, Layout, float | None]] = {}
 
+    def prepare(self) -> None:
+        """Do nothing: the kernels were compiled, or taken from the cache, when they were imported."""
+
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """
         Simulate a trial with physical parameters by name (SI units).

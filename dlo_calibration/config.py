@@ -113,6 +113,9 @@ class Options:
     engine: str = _option(AUTO, 'simulation engine; auto: compiled where it can be, and what it finds is '
                           'simulated by bullet once more; else bullet', choices=ENGINES)
     workers: int = _option(0, 'number of processes that simulate; 0: one per core', minimum=0, maximum=1024)
+    scheduler: str = _option(
+        '', 'address of a Dask scheduler whose workers simulate, on any number of machines, e.g. '
+        'tcp://host:8786; workers has no effect then; empty: this machine alone')
     nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
     time_step: float = _option(0.004, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
     stable_distance: float = _option(

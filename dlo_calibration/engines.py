@@ -26,7 +26,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.simulator import Simulator
 
 INSTALL = 'pip install numba, or apt install python3-numba'
-SLOWER = 'rounds are simulated by PyBullet, about 15 times slower, because'
+SLOWER = 'rounds are simulated by PyBullet, about 30 times slower, because'
 LOG = logging.getLogger('dlo_calibration.engines')
 
 

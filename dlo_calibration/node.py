@@ -58,7 +58,7 @@ from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.options_node import OptionsNode
 from dlo_calibration.recorder import Recorder
-from dlo_calibration.worker import Failure, Progress, SimulatorFactory, Worker
+from dlo_calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
 
 LOG = logging.getLogger('dlo_calibration')  # notices of the rest of the package
 DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains
@@ -356,6 +356,9 @@ class CalibratorNode(OptionsNode):
         for event in self._worker.waiting_events():
             if isinstance(event, Evaluation):
                 self._progress.take(event)
+            elif isinstance(event, Notice):
+                self._detail = event.text
+                self._warn(event.text)
             else:
                 self._send_progress()
                 self._finish(event)

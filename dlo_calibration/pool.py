@@ -13,22 +13,34 @@
 # limitations under the License.
 
 
-"""Processes that simulate: they end with whoever started them, at once, however that one ends."""
+"""
+Processes that simulate: they end with whoever started them, at once, however that one ends.
+
+One that dies is replaced, and what it was doing is done again.
+"""
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import connection, parent_process
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.context import SpawnProcess
+from multiprocessing.reduction import ForkingPickler
 import os
+import queue
 import signal
 import sys
 import threading
+import traceback
 import types
-from typing import Any, Callable, Iterator
+from typing import Any, Callable, Iterator, Mapping
+
+from dlo_calibration.errors import DloCalibrationError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+DEATHS = 3  # of processes at the same work, after which it is given up
+NICENESS = 5  # what answers the user, e.g. a node, comes before what simulates
 _starting = threading.Lock()
 
 
@@ -41,46 +53,152 @@ class ProcessExecutor(Executor):
     """
     An executor of `workers` fresh processes; 0: one per core.
 
-    The processes ignore SIGINT and SIGTERM, so that Ctrl-C reaches the one who
-    knows what to do about it; they end by `close`, or when the parent is gone.
-    They do not import the main module: nothing defined there can be sent.
+    They start at once, and end by `close`, or when the parent is gone.  They
+    ignore SIGINT and SIGTERM, so that Ctrl-C reaches the one who knows what to
+    do about it.  They do not import the main module: nothing defined there can
+    be sent.  A process that dies is replaced, and its call is made again; at
+    which `DEATHS` of them died ends with a `DloCalibrationError`.
+
+    :param on_death: called with a sentence for each death, from any thread.
     """
 
-    def __init__(self, workers: int) -> None:
-        self._context = _Context()
-        self._pool = ProcessPoolExecutor(workers or cores(), mp_context=self._context, initializer=_begin)
+    def __init__(self, workers: int, on_death: Callable[[str], None] = lambda _: None) -> None:
+        self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
+        self._on_death = on_death
+        self._closed = threading.Event()
+        self._processes: dict[_Process, connection.Connection] = {}
+        self._changing = threading.Lock()  # of the processes
+        first = []
+        try:
+            for _ in range(workers or cores()):
+                first.append(self._new_process())
+        except BaseException:
+            self._kill()
+            raise
+        self._threads = [threading.Thread(target=self._serve, args=(process,), name='simulation', daemon=True)
+                         for process in first]
+        for thread in self._threads:
+            thread.start()
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
-        """Return a future that may be cancelled at any time."""
-        # A future of the pool itself may not: where a process died, the pool's own thread fails
-        # on what was cancelled meanwhile, and prints that (CPython 3.11).
-        future: Future[Any] = Future()
-        self._pool.submit(call, *args, **keywords).add_done_callback(lambda done: _pass_on(done, future))
-        return future
+        """Return a future that may be cancelled until a process takes it."""
+        if self._closed.is_set():
+            raise RuntimeError('the executor is closed')
+        task = _Task(Future(), call, args, keywords)
+        self._tasks.put(task)
+        return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End when everything submitted is done."""
-        self._pool.shutdown(wait, cancel_futures=cancel_futures)
+        if cancel_futures:
+            self._cancel_waiting()
+        for _ in self._threads:
+            self._tasks.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
 
     def close(self) -> None:
         """End the processes now, whatever they are doing."""
-        # First of all: where one has died, the pool holds its lock until the others, deaf to SIGTERM, end.
-        for process in self._context.started:
-            process.kill()
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in self._context.started:
+        self._closed.set()
+        self._cancel_waiting()
+        self._kill()
+        self.shutdown()
+
+    def _cancel_waiting(self) -> None:
+        while True:
+            try:
+                task = self._tasks.get_nowait()
+            except queue.Empty:
+                return
+            if task is not None:
+                task.future.cancel()
+                task.future.set_running_or_notify_cancel()
+
+    def _kill(self) -> None:
+        with self._changing:
+            for process in self._processes:
+                process.kill()
+        for process in list(self._processes):
             process.join()
 
+    def _new_process(self) -> _Process:
+        with self._changing:
+            if self._closed.is_set():
+                raise CancelledError
+            here, there = connection.Pipe()
+            process = _Process(target=_work, args=(there,), daemon=True)
+            try:
+                process.start()
+            except OSError as error:
+                raise DloCalibrationError(f'a process that simulates could not be started ({error}); '
+                                          'use fewer workers') from error
+            finally:
+                there.close()
+            self._processes[process] = here
+            return process
 
-def _pass_on(done: Future[Any], future: Future[Any]) -> None:
-    """Give `future` what `done` ended with, unless it was cancelled."""
-    if not future.set_running_or_notify_cancel():
-        return
-    error = CancelledError() if done.cancelled() else done.exception()
-    if error is not None:
-        future.set_exception(error)
-    else:
-        future.set_result(done.result())
+    def _end(self, process: _Process) -> None:
+        """Forget a process that ends or has ended."""
+        with self._changing:
+            self._processes.pop(process).close()
+        process.join()
+
+    def _serve(self, process: _Process | None) -> None:
+        """Let one process after the other do what waits; the work of a thread."""
+        while (task := self._tasks.get()) is not None:
+            if task.future.set_running_or_notify_cancel():
+                process = self._do(task, process)
+        if process is not None:
+            self._end(process)
+
+    def _do(self, task: _Task, process: _Process | None) -> _Process | None:
+        """Give the future of a task its outcome; return the process for the next one, if one lives."""
+        deaths = 0
+        while True:
+            try:
+                process = process or self._new_process()
+                channel = self._processes[process]
+                channel.send((task.call, task.args, task.keywords))
+                result, failure = channel.recv()
+            except (EOFError, OSError):
+                assert process is not None
+                self._end(process)
+                deaths, ending, process = deaths + 1, _ending(process.exitcode), None
+                if self._closed.is_set():
+                    task.future.set_exception(CancelledError())
+                    return None
+                self._on_death(f'a process that simulates {ending}; what it did is done again')
+                if deaths == DEATHS:
+                    task.future.set_exception(DloCalibrationError(
+                        f'{DEATHS} processes one after the other ended unexpectedly at the same evaluation, '
+                        f'the last one {ending}; free memory, or use fewer workers'))
+                    return None
+            except BaseException as error:  # there is no new process, or what cannot be sent
+                task.future.set_exception(error)
+                return process
+            else:
+                if failure is None:
+                    task.future.set_result(result)
+                else:
+                    task.future.set_exception(failure)
+                return process
+
+
+@dataclass(frozen=True)
+class _Task:
+    future: Future[Any]
+    call: Callable[..., Any]
+    args: tuple[Any, ...]
+    keywords: Mapping[str, Any]
+
+
+def _ending(code: int | None) -> str:
+    """Say how a process ended, by its exit code."""
+    if code is not None and code < 0:
+        killed = f'was killed by {signal.Signals(-code).name}'
+        return f'{killed}, as where memory runs out' if code == -signal.SIGKILL else killed
+    return f'ended unexpectedly with exit code {code}'
 
 
 class _Process(SpawnProcess):
@@ -97,19 +215,6 @@ class _Process(SpawnProcess):
                 sys.modules['__main__'] = main
 
 
-class _Context(SpawnContext):
-    """Spawns such processes, and remembers them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.started: list[_Process] = []
-
-    def Process(self, *args: Any, **keywords: Any) -> _Process:  # type: ignore[override]  # noqa: N802
-        process = _Process(*args, **keywords)
-        self.started.append(process)
-        return process
-
-
 @contextmanager
 def _blocked_signals() -> Iterator[None]:
     """Block SIGINT and SIGTERM in this thread; a process started here begins with them blocked."""
@@ -120,11 +225,36 @@ def _blocked_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def _work(channel: connection.Connection) -> None:
+    """Answer calls until the parent hangs up; the work of a process."""
+    _begin()
+    while True:
+        try:
+            call, args, keywords = channel.recv()
+            channel.send((call(*args, **keywords), None))
+        except (EOFError, BrokenPipeError):
+            return
+        except BaseException as error:
+            channel.send((None, _sendable(error)))
+
+
+def _sendable(error: BaseException) -> BaseException:
+    """Return an error that another process can read, with its traceback as a note."""
+    text = ''.join(traceback.format_exception(error))
+    try:
+        error.add_note(f'In a process that simulates:\n{text}')
+        ForkingPickler.loads(ForkingPickler.dumps(error))
+    except Exception:
+        return RuntimeError(text)
+    return error
+
+
 def _begin() -> None:
     """Prepare a process that simulates."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    os.nice(NICENESS)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -23,6 +23,8 @@ from html import escape
 from pathlib import Path
 from typing import Iterable, Sequence
 
+import numpy as np
+
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.errors import InputError
 from dlo_calibration.picture import trial_png
@@ -71,6 +73,8 @@ def write_evaluations(path: Path, result: CalibrationResult) -> None:
     """
     Write every evaluation as a row of a CSV file: parameters (0..100), scores [cm], error [m].
 
+    A trial that was skipped has no score; the score of an abandoned evaluation is a lower bound.
+
     :raises InputError: where the file cannot be written.
     """
     names = result.space.free
@@ -79,12 +83,12 @@ def write_evaluations(path: Path, result: CalibrationResult) -> None:
         with path.open('w', newline='', encoding='utf-8') as stream:
             rows = csv.writer(stream)
             rows.writerow(['evaluation', *names, 'score', *(f'score of {name}' for name in trials),
-                           'mean_error_m', 'failure'])
+                           'mean_error_m', 'failure', 'skipped_trials'])
             for one in result.evaluations:
-                scores = one.scores or [''] * len(trials)
+                scores = ['' if np.isnan(score) else score for score in one.scores] or [''] * len(trials)
                 error = '' if one.errors is None else one.errors.mean
                 rows.writerow([one.index + 1, *(one.values[name] for name in names), one.score, *scores,
-                               error, one.failure])
+                               error, one.failure, one.skipped])
     except OSError as error:
         raise InputError(f'file {path}', str(error), 'a place that can be written to',
                          'choose another one with --output') from error

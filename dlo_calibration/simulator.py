@@ -55,11 +55,19 @@ class Simulator(Protocol):
     """
     Simulates trials; the same call gives the same rollout, bit for bit.
 
-    It is pickled to worker processes before it is used, so what cannot be
-    pickled is made at the first `simulate` and dropped when pickled.
+    It is pickled to worker processes, and copied for worker threads, so what
+    belongs to one process or thread is made at the first `simulate` and dropped
+    by `__getstate__`.
     """
 
     name: str
+
+    def prepare(self) -> None:
+        """
+        Do once what all copies would else do each for itself, e.g. compile into a cache.
+
+        Called before the first copy is made.
+        """
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """

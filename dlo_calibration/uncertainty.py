@@ -115,6 +115,24 @@ class Uncertainty:
         return tuple(combined)
 
 
+def good_count(evaluations: int) -> int:
+    """Return how many of that many evaluations count as good: the best 5 %, 8 at least."""
+    return max(BEST_MINIMUM, round(BEST_SHARE * evaluations))
+
+
+def matters_below(scores: Sequence[float], budget: int) -> float:
+    """
+    Return the score above which an evaluation cannot change the spread any more.
+
+    :param scores: so far, of evaluations that were simulated completely.
+    :param budget: how many evaluations there will be at most.
+    :returns: infinite where every score still matters.
+    """
+    count = good_count(budget)
+    finite = sorted(score for score in scores if np.isfinite(score))
+    return finite[count - 1] if len(finite) >= 2 * count else float('inf')
+
+
 def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     """
     Return how far the parameters of the best evaluations lie apart.
@@ -127,7 +145,7 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     the trials: it says what this calibration knows, not what the trials could tell.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
-    count = max(BEST_MINIMUM, round(BEST_SHARE * len(good)))
+    count = good_count(len(evaluations))
     everywhere = np.ones(len(best), dtype=np.bool_)
     if len(good) < 2 * count:
         unknown = np.ones_like(best)

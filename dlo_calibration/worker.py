@@ -17,7 +17,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures.process import BrokenProcessPool
+from collections import Counter
+from contextlib import closing, ExitStack
 from dataclasses import dataclass, replace
 import queue
 import threading
@@ -27,6 +28,7 @@ from typing import Callable, Iterator, Sequence, Union
 
 from dlo_calibration import pool
 from dlo_calibration.calibration import calibrate, CalibrationResult, confirmed, Evaluation
+from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.search import SEARCHES
@@ -52,37 +54,54 @@ class Failure:
     details: str = ''
 
 
-Event = Union[Evaluation, CalibrationResult, Failure]
+@dataclass(frozen=True)
+class Notice:
+    """
+    Something that the user should know at once, and that does not end the calibration.
+
+    :param text: one line, e.g. about a process that died.
+    """
+
+    text: str
+
+
+Event = Union[Evaluation, Notice, CalibrationResult, Failure]
 
 
 def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: SimulatorFactory,
                    on_evaluation: Callable[[Evaluation], None] | None = None,
-                   should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
+                   should_stop: Callable[[], bool] = lambda: False,
+                   on_notice: Callable[[str], None] = lambda _: None) -> CalibrationResult:
     """
-    Calibrate as `options` say, in as many processes as they say.
+    Calibrate as `options` say, in as many processes as they say, or on the machines of a scheduler.
 
     The node and the command line both come here, so that the same trials and
     options give the same result in both.
 
+    :param on_notice: called at once with a sentence where e.g. a process died, from any
+        thread; `CalibrationResult.warnings` tells it, too.
     :raises DloCalibrationError: where there is no result.
     """
+    notices: list[str] = []
+
+    def notice(text: str) -> None:
+        notices.append(text)
+        on_notice(text)
+
     space = options.space
     search = SEARCHES[options.search](space.dimension, options.seed)
-    workers = min(options.workers or pool.cores(), options.evaluations)
-    executor = pool.ProcessExecutor(workers) if workers > 1 else None
-    simulator = make_simulator(options)
-    try:
+    with ExitStack() as stack:
+        executor = _executor(options, notice, on_notice)  # its processes start while the engine is made
+        if executor is not None:
+            stack.callback(executor.close)
+        simulator = stack.enter_context(closing(make_simulator(options)))
+        if executor is not None:
+            simulator.prepare()
         result = calibrate(
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
-    except BrokenProcessPool as error:
-        raise DloCalibrationError(
-            'a process that simulates ended unexpectedly (out of memory, or killed from outside); '
-            'try again with fewer workers') from error
-    finally:
-        if executor is not None:
-            executor.close()
-        simulator.close()
+    told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
+    result = replace(result, warnings=(*result.warnings, *told))
     return confirmed_with(result, options, make_simulator, should_stop)
 
 
@@ -110,6 +129,15 @@ def confirmed_with(result: CalibrationResult, options: Options, make_simulator: 
         return replace(result, warnings=(*result.warnings, f'not confirmed by engine {CONFIRMING}: {text}'))
 
 
+def _executor(options: Options, on_death: Callable[[str], None],
+              on_wait: Callable[[str], None]) -> pool.ProcessExecutor | ClusterExecutor | None:
+    """Return where evaluations are simulated; None: here."""
+    if options.scheduler:
+        return ClusterExecutor(options.scheduler, on_death, on_wait)
+    workers = min(options.workers or pool.cores(), options.evaluations)
+    return pool.ProcessExecutor(workers, on_death) if workers > 1 else None
+
+
 class Progress:
     """
     How far a calibration has come.
@@ -123,12 +151,14 @@ class Progress:
         self.count = 0
         self.newest: Evaluation | None = None
         self.best: Evaluation | None = None
+        self._simulations = 0
         self._trials = trials
         self._clock, self._begun = clock, clock()
 
     def take(self, evaluation: Evaluation) -> None:
         """Take the next evaluation."""
         self.count += 1
+        self._simulations += self._trials - evaluation.skipped
         self.newest = evaluation
         if self.best is None or evaluation.score < self.best.score:
             self.best = evaluation
@@ -136,7 +166,7 @@ class Progress:
     @property
     def simulations_per_second(self) -> float:
         """Rollouts per second so far."""
-        return self.count * self._trials / self._elapsed
+        return self._simulations / self._elapsed
 
     @property
     def seconds_left(self) -> float:
@@ -153,8 +183,8 @@ class Worker:
     """
     Calibrates in a thread of its own.
 
-    `events` receives an `Evaluation` for each finished one, in order, and at the end
-    exactly one `CalibrationResult` or `Failure`.
+    `events` receives an `Evaluation` for each finished one, in order, a `Notice` where
+    something else is worth to be known, and at the end exactly one `CalibrationResult` or `Failure`.
 
     :param make_simulator: called in the thread, so that an engine lives where it is used.
     """
@@ -204,7 +234,8 @@ class Worker:
     def _work(self, trials: Sequence[Trial], options: Options, stop: threading.Event) -> None:
         event: Event
         try:
-            event = calibrate_with(trials, options, self._make_simulator, self.events.put, stop.is_set)
+            event = calibrate_with(trials, options, self._make_simulator, self.events.put, stop.is_set,
+                                   lambda text: self.events.put(Notice(text)))
         except DloCalibrationError as error:
             event = Failure(str(error))
         except BaseException as error:  # a thread that dies silently leaves the user waiting for ever

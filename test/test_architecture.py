@@ -37,7 +37,7 @@ ORDER = (
     # engines
     'rollout', 'contact', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
-    'pool', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
+    'pool', 'cluster', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
     'options_node', 'node',
     'calibrator', 'cli', '__main__', 'demo',
 )
@@ -50,13 +50,14 @@ ONLY = {
     'numba': {'kernels'},
     'cma': {'search'},
     'lxml': {'xml'},
+    'distributed': {'cluster'},
     'dlo_calibration.bullet': {'engines'},
     'dlo_calibration.compiled': {'engines'},
     'dlo_calibration.engines': {'node', 'cli'},
     'dlo_calibration.trial': set(ORDER) - {'search'},
 }
 
-NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'matplotlib', 'scipy.optimize', 'cma')
+NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))
 

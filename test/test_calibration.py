@@ -15,7 +15,11 @@
 """The calibration loop on an analytic simulator: what it finds, in what order, and how it ends."""
 
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
+import threading
+import time
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -30,7 +34,7 @@ from dlo_calibration import (
     SimulationError,
     Trial,
 )
-from dlo_calibration.search import SEARCHES
+from dlo_calibration.search import RandomSearch, SEARCHES
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
 TRIALS = (toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=1.0))
@@ -93,7 +97,7 @@ def test_every_evaluation_is_kept_and_reported_in_order():
     assert [evaluation.index for evaluation in result.evaluations] == list(range(120))
     assert [e.scores for e in result.evaluations] == [e.scores for e in seen]
     assert all(len(e.scores) == 2 for e in seen)
-    assert result.simulations == 240
+    assert result.simulations == 240 - sum(e.skipped for e in seen)
 
 
 def test_residuals_are_kept_of_the_best_only():
@@ -129,6 +133,7 @@ def test_the_record_says_how_it_was_found():
 def test_a_search_that_finishes_early_says_why():
     class Finished:
         name = 'finished'
+        limit = float('inf')
         stop_reason = 'it cannot get better'
 
         def __init__(self):
@@ -247,10 +252,16 @@ def test_without_trials_there_is_nothing_to_calibrate():
         found(trials=())
 
 
+def scores(evaluation):
+    """Return what compares equal bit for bit, NaN too."""
+    return np.array(evaluation.scores).tobytes()
+
+
 def same(first, second):
     """Compare two results bit for bit, all but the time they took."""
     assert [e.point.tobytes() for e in first.evaluations] == [e.point.tobytes() for e in second.evaluations]
-    assert [e.scores for e in first.evaluations] == [e.scores for e in second.evaluations]
+    assert [scores(e) for e in first.evaluations] == [scores(e) for e in second.evaluations]
+    assert [e.skipped for e in first.evaluations] == [e.skipped for e in second.evaluations]
     assert [e.failure for e in first.evaluations] == [e.failure for e in second.evaluations]
     assert first.parameters == second.parameters
     assert first.best.residuals.tobytes() == second.best.residuals.tobytes()
@@ -298,3 +309,89 @@ def test_trials_of_unequal_shape_are_compared_each_by_itself():
     assert result.best.residuals.shape == (11 * 3 + 2 * 21 * 3,)
     for trial, chains in zip(result.trials, result.chains, strict=True):
         assert chains == pytest.approx(ToySimulator().simulate(trial, result.physical()).chains, abs=1e-12)
+
+
+class Patient(RandomSearch):
+    """It wants to know every score."""
+
+    limit = float('inf')
+
+
+@pytest.mark.parametrize('fail_below', [-1.0, 20.0])
+@pytest.mark.parametrize('budget', [150, 400])
+def test_abandoning_evaluations_changes_nothing_but_the_time(budget, fail_below):
+    simulator = ToySimulator(fail_below=fail_below)
+    quick = found(simulator=simulator, budget=budget)
+    whole = calibrate(TRIALS, ParameterSpace(), simulator, Patient(4, 1), budget=budget)
+    assert not any(e.abandoned for e in whole.evaluations)
+    assert any(e.abandoned for e in quick.evaluations)
+    assert quick.parameters == whole.parameters
+    assert quick.best.scores == whole.best.scores
+    assert quick.best.residuals.tobytes() == whole.best.residuals.tobytes()
+    for early, complete in zip(quick.evaluations, whole.evaluations, strict=True):
+        assert early.point.tobytes() == complete.point.tobytes()
+        if early.abandoned:
+            assert quick.best.score < early.score <= complete.score
+            assert early.errors is None
+        else:
+            assert (early.scores, early.failure) == (complete.scores, complete.failure)
+
+
+def test_abandoned_trials_are_not_simulated():
+    simulator = ToySimulator()
+    simulate, done = simulator.simulate, []
+    simulator.simulate = lambda trial, physical: done.append(trial.name) or simulate(trial, physical)
+    result = found(simulator=simulator)
+    assert result.simulations == len(done) < 0.9 * 300
+    assert sum(np.isnan(e.scores).sum() for e in result.evaluations if e.scores) == 300 - len(done)
+    assert result.warnings == ()
+
+
+def test_a_failed_evaluation_counts_what_was_simulated():
+    result = found(simulator=ToySimulator(fail_below=50.0), budget=8)
+    failed = [e for e in result.evaluations if e.failure]
+    assert all(e.skipped == 1 and not e.abandoned for e in failed)
+    assert result.simulations == 16 - len(failed)
+
+
+class OneThread(ToySimulator):
+    """It may be used by the thread that used it first only, until it is closed."""
+
+    opened: ClassVar[list] = []
+    closed: ClassVar[list] = []
+
+    def simulate(self, trial, physical):
+        if not hasattr(self, 'home'):
+            self.home = threading.get_ident()
+            self.opened.append(id(self))
+            time.sleep(0.02)  # so that the other thread gets its share
+        assert self.home == threading.get_ident()
+        return super().simulate(trial, physical)
+
+    def close(self):
+        self.closed.append(id(self))
+
+    def __getstate__(self):
+        return {key: value for key, value in self.__dict__.items() if key != 'home'}
+
+
+def test_each_thread_has_a_simulator_of_its_own_until_the_next_calibration_or_its_end():
+    simulator = OneThread()
+    with ThreadPoolExecutor(2) as executor:
+        first = found(simulator=simulator, budget=40, executor=executor)
+        assert len(OneThread.opened) == 2
+        assert OneThread.closed == []
+        same(first, found(simulator=simulator, budget=40, executor=executor))
+        assert OneThread.closed == OneThread.opened[:2]
+    assert sorted(OneThread.closed) == sorted(OneThread.opened)
+    assert not hasattr(simulator, 'home')
+
+
+def test_threads_give_the_result_of_pybullet_bit_for_bit():
+    bullet = pytest.importorskip('dlo_calibration.bullet')
+    trials = [replace(trial, goals=(Goal(trial.goals[0].chain, 1.6),)) for trial in TRIALS]
+    here = found(trials=trials, simulator=bullet.BulletSimulator(settle_limit=0.5), budget=6)
+    with ThreadPoolExecutor(3) as executor:
+        elsewhere = found(trials=trials, simulator=bullet.BulletSimulator(settle_limit=0.5), budget=6,
+                          executor=executor)
+    same(here, elsewhere)

@@ -30,6 +30,7 @@ from dlo_calibration.worker import calibrate_with
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')
 COMPILED = 'dlo_calibration.compiled'
+KERNELS = 'dlo_calibration.kernels'
 
 
 @pytest.fixture
@@ -44,7 +45,9 @@ def notices(caplog):
 def without_numba(monkeypatch):
     """Let numba not be installed."""
     monkeypatch.setitem(sys.modules, 'numba', None)
-    monkeypatch.delitem(sys.modules, COMPILED, raising=False)
+    for name in (COMPILED, KERNELS):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.delattr('dlo_calibration.kernels', raising=False)  # where it was imported before
 
 
 @pytest.fixture
@@ -76,7 +79,7 @@ def test_bullet_is_one_option_away(notices):
 def test_without_numba_auto_is_bullet_and_says_so_once(without_numba, notices):
     for _ in range(3):
         assert type(make_simulator(Options())) is BulletSimulator
-    assert notices() == ['rounds are simulated by PyBullet, about 15 times slower, because numba is not '
+    assert notices() == ['rounds are simulated by PyBullet, about 30 times slower, because numba is not '
                          'installed: pip install numba, or apt install python3-numba']
 
 
@@ -111,7 +114,7 @@ def test_the_compiled_engine_refuses_a_scene_by_name(scene):
 def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert notices() == [f'rounds are simulated by PyBullet, about 15 times slower, because engine compiled '
+    assert notices() == [f'rounds are simulated by PyBullet, about 30 times slower, because engine compiled '
                          f'knows no scene: {scene}']
 
 

@@ -33,7 +33,8 @@ from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation, 
 from dlo_calibration.config import ENGINES as ENGINE_NAMES
 from dlo_calibration.config import Options
 from dlo_calibration.engines import ENGINES
-from dlo_calibration.worker import calibrate_with, Failure, Progress, Worker
+from dlo_calibration.parameters import BY_NAME
+from dlo_calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE = 60.0
@@ -60,11 +61,14 @@ def test_gives_every_evaluation_in_order_and_then_the_result(workers):
 
 
 def test_result_does_not_depend_on_the_number_of_processes():
-    one, three = (calibrate_with(toy_trials(2), options(workers=n), lambda _: ToySimulator()) for n in (1, 3))
-    assert one.values == three.values
-    assert one.best.scores == three.best.scores
-    assert all(np.array_equal(a, b) for a, b in zip(one.chains, three.chains, strict=True))
-    assert one.parameters == three.parameters
+    one, two, four = (calibrate_with(toy_trials(2), options(workers=n, evaluations=100),
+                                     lambda _: ToySimulator()) for n in (1, 2, 4))
+    for other in (two, four):
+        assert one.parameters == other.parameters
+        assert one.simulations == other.simulations < 200
+        assert one.best.residuals.tobytes() == other.best.residuals.tobytes()
+        assert [np.array(e.scores).tobytes() for e in one.evaluations] == [
+            np.array(e.scores).tobytes() for e in other.evaluations]
 
 
 @pytest.mark.parametrize('name', ['flexibility', 'elasticity', 'friction'])
@@ -137,12 +141,61 @@ def test_refuses_a_second_start_and_takes_the_next_one():
     assert isinstance(finished(worker)[-1], CalibrationResult)
 
 
-def test_killed_process_ends_as_a_failure_that_says_so():
+def test_killed_process_is_told_at_once_and_in_the_result_which_stays_the_same():
     worker = Worker(lambda _: ToySimulator(0.005))
-    worker.start(toy_trials(1), options(workers=2, evaluations=10000))
-    worker.events.get(timeout=PATIENCE)
+    worker.start(toy_trials(2), options(workers=2, evaluations=150))
+    first = worker.events.get(timeout=PATIENCE)
     os.kill(spawned(os.getpid(), 2)[0], signal.SIGKILL)
-    assert 'ended unexpectedly' in finished(worker)[-1].text
+    *events, result = [first, *finished(worker)]
+    notice, = (event for event in events if isinstance(event, Notice))
+    assert 'was killed by SIGKILL' in notice.text
+    assert result.warnings == (notice.text,)
+    alone = calibrate_with(toy_trials(2), options(evaluations=150), lambda _: ToySimulator())
+    assert result.parameters == alone.parameters
+    assert result.best.residuals.tobytes() == alone.best.residuals.tobytes()
+    assert [e.index for e in events if isinstance(e, Evaluation)] == list(range(150))
+
+
+class Deadly(ToySimulator):
+    """It kills its process at some points: always, or where a file does not exist yet."""
+
+    def __init__(self, file=None):
+        super().__init__()
+        self.file = file
+
+    def simulate(self, trial, physical):
+        if BY_NAME['flexibility'].value(physical['flexibility']) > 90 and (
+                self.file is None or not self.file.exists()):
+            if self.file is not None:
+                self.file.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().simulate(trial, physical)
+
+
+def test_an_evaluation_whose_process_dies_is_repeated(tmp_path):
+    told = []
+    result = calibrate_with(toy_trials(2), options(workers=2, evaluations=60),
+                            lambda _: Deadly(tmp_path / 'died'), on_notice=told.append)
+    assert len(told) == 1
+    alone = calibrate_with(toy_trials(2), options(evaluations=60), lambda _: ToySimulator())
+    assert result.parameters == alone.parameters
+    assert result.chains[0].tobytes() == alone.chains[0].tobytes()
+
+
+def test_an_evaluation_that_kills_every_process_ends_the_calibration():
+    told = []
+    with pytest.raises(DloCalibrationError, match='3 processes one after the other .* fewer workers'):
+        calibrate_with(toy_trials(1), options(workers=2, evaluations=60), lambda _: Deadly(),
+                       on_notice=told.append)
+    assert len(told) >= 3
+
+
+def test_the_simulator_is_prepared_before_any_copy_is_made():
+    ready = []
+    simulator = ToySimulator()
+    simulator.prepare = lambda: (ready.append(1), delattr(simulator, 'prepare'))
+    calibrate_with(toy_trials(1), options(workers=2, evaluations=4), lambda _: simulator)
+    assert ready == [1]
 
 
 def spawned(parent, count):

@@ -46,6 +46,9 @@ class ToySimulator:
         self.fail_below = fail_below
         self.crash = crash
 
+    def prepare(self) -> None:
+        """Need nothing."""
+
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """Return the goal chains of a trial, analytically."""
         if self.seconds:

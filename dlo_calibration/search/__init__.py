@@ -29,4 +29,8 @@ __all__ = ['CmaEs', 'Fit', 'Hints', 'LeastSquares', 'Observation', 'RandomSearch
 
 #: name -> constructor(dimension, seed, hints=None)
 SEARCHES: Mapping[str, Callable[..., Search]] = {
-    search.name: search for search in (LeastSquares, RandomSearch, CmaEs, Sequential)}
+    LeastSquares.name: LeastSquares,
+    RandomSearch.name: RandomSearch,
+    CmaEs.name: CmaEs,
+    Sequential.name: Sequential,
+}

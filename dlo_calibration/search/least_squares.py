@@ -116,7 +116,7 @@ class _Descent:
         """(d,) True where going from 0 to 1 changes the residuals by more than their own size."""
         size = np.linalg.norm(self.jacobian, axis=0)
         noise = self.loss.scale
-        return size > max(noise, 1e-9 * float(size.max(initial=0.0)), 1e-12)
+        return np.asarray(size > max(noise, 1e-9 * float(size.max(initial=0.0)), 1e-12))
 
 
 def lower(one: Floats, other: Floats) -> bool:
@@ -419,7 +419,7 @@ class LeastSquares(PlannedSearch):
         wanted = min(max(VISIBLE * here.loss.scale, STEP_OVER_ROUGHNESS * here.roughness), here.loss.scale)
         # Only a parameter that is weak beside the others is moved far.
         most = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
-        return np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP)
+        return np.asarray(np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP))
 
 
 def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:

@@ -31,9 +31,10 @@ class Observation:
     What one point gave.
 
     :param point: (d,) in the unit cube.
-    :param score: to be minimised; infinite where the simulation failed.
+    :param score: to be minimised; infinite where the simulation failed, and no
+        more than a lower bound where it was abandoned above the search's `limit`.
     :param residuals: (m,) [m] simulated minus observed coordinates of all
-        trials; None where the simulation failed.
+        trials; None where the simulation failed or was abandoned.
     """
 
     point: Floats
@@ -76,7 +77,9 @@ class Hints:
     @property
     def excited(self) -> NDArray[np.bool_]:
         """(d,) True for the parameters that some trial excites; all where nothing is known."""
-        return self.excites.any(axis=0) if len(self.excites) else np.ones(len(self.start), dtype=np.bool_)
+        if len(self.excites):
+            return np.asarray(self.excites.any(axis=0))
+        return np.ones(len(self.start), dtype=np.bool_)
 
 
 class Search(Protocol):
@@ -90,6 +93,14 @@ class Search(Protocol):
 
         How many is the method's choice and never depends on the number of
         workers.  No points at all means that it has finished.
+        """
+
+    @property
+    def limit(self) -> float:
+        """
+        Score above which the search does not care how bad a point is; infinite: it always cares.
+
+        Asked before each `ask`; such a point need not be simulated to its end.
         """
 
     def tell(self, observations: Sequence[Observation]) -> None:

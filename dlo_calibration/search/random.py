@@ -23,7 +23,9 @@ import numpy as np
 from dlo_calibration.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
-BATCH = 50  # points asked at a time: enough to keep many processes busy, few enough to hold their residuals
+#: Points asked at a time: enough to keep 1, 2, 4, ... 32 processes busy to the end, few enough that it is
+#: soon known which scores matter.
+BATCH = 32
 
 
 class RandomSearch:
@@ -45,6 +47,11 @@ class RandomSearch:
     def ask(self, limit: int) -> Floats:
         """Return the next points (m, d) of one random sequence, however it is divided."""
         return self._generator.random((min(limit, BATCH), self._dimension))
+
+    @property
+    def limit(self) -> float:
+        """No score matters to what is asked next."""
+        return 0.0
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Remember the best; what was found changes nothing else."""

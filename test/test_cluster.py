@@ -1,0 +1,153 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A real Dask scheduler with real workers, over TCP on this machine: the same result, whoever dies."""
+
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from toy_messages import toy_trials
+from toy_simulator import ToySimulator
+
+from dlo_calibration import cluster, DloCalibrationError, InputError
+from dlo_calibration.config import Options
+from dlo_calibration.worker import calibrate_with
+
+distributed = pytest.importorskip('distributed', reason='the extra "distributed" of setup.py has it')
+
+ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 60.0
+PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test'), os.environ.get('PYTHONPATH', '')])
+
+
+def dask(part, *words, **environment):
+    """Start a part of a cluster as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, '-m', f'distributed.cli.dask_{part}', '--host', '127.0.0.1', '--no-dashboard',
+         *words], env={**os.environ, 'PYTHONPATH': PATHS, **environment}, cwd='/', stderr=subprocess.DEVNULL)
+
+
+@contextmanager
+def running(folder, workers=2):
+    """Give the address of a scheduler, and the processes: its own and the workers'."""
+    file = folder / 'scheduler.json'
+    scheduler = dask('scheduler', '--port', '0', '--scheduler-file', str(file))
+    processes = [scheduler]
+    try:
+        begun = time.monotonic()
+        while not file.exists() or not file.read_text():
+            assert time.monotonic() - begun < PATIENCE and scheduler.poll() is None
+            time.sleep(0.02)
+        address = json.loads(file.read_text())['address']
+        processes += [dask('worker', address, '--no-nanny', '--nthreads', '1')
+                      for _ in range(workers)]
+        yield address, processes
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def wait_for_workers(address, count):
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(count, timeout=PATIENCE)
+
+
+@pytest.fixture
+def machines(tmp_path):
+    with running(tmp_path) as (address, processes):
+        wait_for_workers(address, 2)
+        yield address, processes
+
+
+def options(address='', **flat):
+    return Options.of({'evaluations': 100, 'workers': 1, 'scheduler': address, **flat})
+
+
+def same(first, second):
+    assert first.parameters == second.parameters
+    assert first.simulations == second.simulations
+    assert first.best.residuals.tobytes() == second.best.residuals.tobytes()
+    assert [e.score for e in first.evaluations] == [e.score for e in second.evaluations]
+
+
+def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines, capfd):
+    address, processes = machines
+    alone = calibrate_with(toy_trials(2), options(), lambda _: ToySimulator())
+    told = []
+    whole = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(), on_notice=told.append)
+    same(alone, whole)
+    assert told == []
+
+    def kill(evaluation):
+        if evaluation.index == 10:
+            os.kill(processes[1].pid, signal.SIGKILL)
+
+    torn = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(0.005), kill,
+                          on_notice=told.append)
+    same(alone, torn)
+    assert len(told) == 1
+    assert 'the scheduler lost the worker tcp://127.0.0.1:' in told[0]
+    assert torn.warnings == tuple(told)
+    assert capfd.readouterr() == ('', '')
+
+
+def test_a_stop_leaves_nothing_at_the_scheduler(machines):
+    address, _ = machines
+    seen = []
+    result = calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.05),
+                            seen.append, lambda: len(seen) >= 3)
+    assert result.stop_reason == 'stopped on request'
+    assert len(result.evaluations) == 3
+    with distributed.Client(address, set_as_default=False) as client:
+        begun = time.monotonic()
+        while tasks := client.run_on_scheduler(lambda dask_scheduler: sorted(map(str, dask_scheduler.tasks))):
+            assert time.monotonic() - begun < PATIENCE, tasks
+            time.sleep(0.05)
+
+
+def test_without_workers_it_says_so_and_waits(tmp_path):
+    told = []
+    with running(tmp_path, 0) as (address, _), pytest.raises(DloCalibrationError, match='stopped before the'):
+        calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator(), None,
+                       lambda: bool(told), told.append)
+    assert 'has no workers yet' in told[0]
+
+
+@pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])
+def test_an_address_that_is_none_is_refused(address):
+    with pytest.raises(InputError, match='parameter scheduler: got .* start one with: dask scheduler'):
+        calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator())
+
+
+def test_a_scheduler_that_does_not_answer_is_refused():
+    with socket.socket() as taken:
+        taken.bind(('127.0.0.1', 0))  # and does not listen
+        with pytest.raises(InputError, match='such as tcp://host:8786'):
+            cluster.ClusterExecutor(f'tcp://127.0.0.1:{taken.getsockname()[1]}')
+
+
+def test_without_the_library_it_says_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    with pytest.raises(InputError, match=r"pip install 'dlo_calibration\[distributed\]'"):
+        calibrate_with(toy_trials(1), options('tcp://127.0.0.1:1'), lambda _: ToySimulator())
