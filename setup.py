@@ -52,7 +52,6 @@ setup(
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.
     install_requires=[
-        'cma>=3.3',
         'lxml>=5.2',
         'matplotlib>=3.6',
         'mcap>=1.6',
@@ -73,7 +72,10 @@ setup(
             'ros-jazzy-rclpy',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        # The search cma_es; rosdep has no key for it.
+        'cma_es': ['cma>=4.0'],
         'test': [
+            'cma>=4.0',
             'colcon-core',
             'colcon-ros',
             'distributed>=2023.12',

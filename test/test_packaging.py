@@ -41,6 +41,9 @@ ROSDEP_KEYS = {
     'ruamel': 'python3-ruamel.yaml',
 }
 
+#: Imported only by what a user chooses, with words that tell what to install where it is missing.
+OPTIONAL = {'cma', 'distributed'}  # have no rosdep key; imported where a search or a scheduler asks for them
+
 
 def third_party_imports():
     """List the top-level names that whatever is installed imports from others."""
@@ -76,7 +79,6 @@ def test_manifest_and_setup_give_the_same_version():
     assert manifest().findtext('version') == setup_value('version')
 
 
-WITHOUT_KEY = {'cma', 'distributed'}  # of rosdep; imported where the search or the scheduler asks for it
 
 
 @pytest.mark.parametrize('name', third_party_imports())
@@ -84,7 +86,7 @@ def test_what_is_imported_is_declared(name):
     keys = {element.text for element in manifest().iterfind('exec_depend')}
     if name in keys:
         return  # a ROS package, which has the name of its module and is not for setup.py
-    if name not in WITHOUT_KEY:
+    if name not in OPTIONAL:
         assert ROSDEP_KEYS.get(name, f'python3-{name}') in keys, 'add it to package.xml'
     requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
     distributions = packages_distributions().get(name, [name])

@@ -16,13 +16,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Generator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.chain import Floats
+from dlo_calibration.search.descent import Descent, Fit, NEAR
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
@@ -32,91 +32,23 @@ FEWEST_STARTS = 8
 FIRST_STEP = 0.03  # of a finite difference
 LARGEST_STEP = 0.2
 VISIBLE = 0.2  # share of the loss's scale by which a finite difference is to change the residuals
-NEAR = 0.03  # a Jacobian measured no further away than that counts as measured here
 SMALLEST_STEP = 0.005  # below it, contacts that come and go are all that one sees
 STEP_OVER_ROUGHNESS = 10.0  # a column's change over what the model could not predict
-FIRST_RADIUS = 0.25
 LARGEST_RADIUS = 0.5
 SPECULATIVE = 1 / 4  # radius of the second point tried, in radii of the first
 DONE_STEP = 1e-3  # converged where the next step is not longer, in any parameter
 DONE_GAIN = 1e-4  # or would not lower the cost by more than this share of it
-NOISE_GAIN = 0.1
+NOISE_GAIN = 0.1  # or, where the residuals are rough, than this share of their roughness over their spread,
+MOST_ROUGHNESS = 0.03  # which counts no more than that
 SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
-RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
 SAME_PLACE = 0.03  # two descents that end that near to each other found the same minimum
 SAME_COST = 1e-3  # or that near in cost, as a share
 MOST_CHECKS = 2  # other starts followed once a minimum has been found
 BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too,
 BESIDE = 0.1  # unless it is that near
 WORTH_A_LOOK = 0.02  # share of the cost that such a place promises to save
-REACH = 0.1
+REACH = 0.1  # from such a place, in each parameter
 MOST_ITERATIONS = 25
-DAMPING = 1e-4  # of the largest column's square: enough that a parameter without effect stays
-
-
-@dataclass(frozen=True)
-class Fit:
-    """
-    What is known at the point of lowest cost.
-
-    :param point: (d,) in the unit cube.
-    :param residuals: (m,) [m] there.
-    :param jacobian: (m, d) their derivative by the parameters [m per unit cube,
-        that is per 100 of the 0..100 scale], by finite differences of
-        SMALLEST_STEP to LARGEST_STEP beside the point.
-    :param cost: of `loss` [m^2].
-    :param loss: its scale came from the residuals.
-    :param measured: (d,) True where a parameter had a measurable effect; the
-        others kept the value that they had.
-    """
-
-    point: Floats
-    residuals: Floats
-    jacobian: Floats
-    cost: float
-    loss: Huber
-    measured: NDArray[np.bool_]
-
-
-@dataclass
-class _Descent:
-    """Where a descent stands; the Jacobian was measured at `origin`, and updated since by some steps."""
-
-    point: Floats
-    residuals: Floats
-    loss: Huber
-    jacobian: Floats
-    radius: float = FIRST_RADIUS
-    roughness: float = 0.0  # [m] root mean square of what the last step's model did not predict
-    origin: Floats | None = None
-    updates: int = 0  # of the Jacobian, by steps after which it was not good
-    ended: str = ''
-
-    @property
-    def cost(self) -> float:
-        return self.loss.cost(self.residuals)
-
-    @property
-    def known_here(self) -> bool:
-        """Whether the Jacobian was measured no further away than its own differences reach."""
-        return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
-
-    def rivals(self, starts: Sequence[Observation]) -> bool:
-        """Whether one of the starts costs hardly more than it does here."""
-        return any(self.loss.cost(one.residuals) < RIVAL * self.cost for one in starts)
-
-    def move(self, observation: Observation) -> None:
-        assert observation.residuals is not None
-        self.point, self.residuals = observation.point, observation.residuals
-        loss = Huber.of(self.residuals)
-        if loss.scale < self.loss.scale:  # never larger again, so that costs of one descent compare
-            self.loss = loss
-
-    def measured(self) -> NDArray[np.bool_]:
-        """(d,) True where going from 0 to 1 changes the residuals by more than their own size."""
-        size = np.linalg.norm(self.jacobian, axis=0)
-        noise = self.loss.scale
-        return np.asarray(size > max(noise, 1e-9 * float(size.max(initial=0.0)), 1e-12))
 
 
 def lower(one: Floats, other: Floats) -> bool:
@@ -173,7 +105,7 @@ class LeastSquares(PlannedSearch):
     def _plan(self) -> Plan:
         starts = self._in_turn((yield from self._starts()))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
-        beyond: list[_Descent] = []
+        beyond: list[Descent] = []
         found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
         while found < 2 and checks < MOST_CHECKS:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
@@ -199,12 +131,12 @@ class LeastSquares(PlannedSearch):
         self._keep(best)
         return best.ended + (f'; reached from {found} starts' if found > 1 else '')
 
-    def _begin(self, start: Observation) -> _Descent:
+    def _begin(self, start: Observation) -> Descent:
         assert start.residuals is not None
-        return _Descent(start.point, start.residuals, Huber.of(start.residuals),
-                        np.zeros((len(start.residuals), self._dimension)))
+        return Descent(start.point, start.residuals, Huber.of(start.residuals),
+                       np.zeros((len(start.residuals), self._dimension)))
 
-    def _look_beyond(self, here: _Descent) -> Generator[Floats, Sequence[Observation], list[_Descent]]:
+    def _look_beyond(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
         """
         Look along the whole range of the parameter of least effect: minima lie side by side there.
 
@@ -221,8 +153,8 @@ class LeastSquares(PlannedSearch):
         found = []
         for one in observations:
             if one.residuals is not None:
-                there = _Descent(one.point, one.residuals, here.loss, here.jacobian, NEAR, origin=here.origin)
-                predicted = self._predicted(there, self._step(there, REACH))
+                there = Descent(one.point, one.residuals, here.loss, here.jacobian, NEAR, origin=here.origin)
+                predicted = there.predicted(there.step(REACH))
                 found.append((min(predicted, there.cost), there))
         found.sort(key=lambda pair: pair[0])
         return [there for predicted, there in found[:1] if predicted < (1 - WORTH_A_LOOK) * here.cost]
@@ -240,30 +172,36 @@ class LeastSquares(PlannedSearch):
             # Half of them keep to the estimate: where it is good it saves a lot, where it is wrong not all.
             points[::2] = np.where(np.isnan(hint), points[::2], hint)
             points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
-            observations = yield np.unique(points, axis=0)
+            order = np.unique(points, axis=0, return_index=True)[1]
+            observations = yield points[np.sort(order)]
             starts = [one for one in observations if one.residuals is not None]
             if starts:
                 return starts
 
-    def _in_turn(self, starts: Sequence[Observation]) -> list[Observation]:
-        """Sort start points by their cost, all by the loss of the best."""
+    @staticmethod
+    def _in_turn(starts: Sequence[Observation]) -> list[Observation]:
+        """Sort start points by their cost, all by the narrowest of their losses."""
         loss = min((Huber.of(one.residuals) for one in starts if one.residuals is not None),
                    key=lambda candidate: candidate.scale)
         return sorted(starts, key=lambda one: loss.cost(one.residuals))
 
-    def _same(self, one: _Descent, other: _Descent) -> bool:
+    @staticmethod
+    def _same(one: Descent, other: Descent) -> bool:
         loss = min(one.loss, other.loss, key=lambda candidate: candidate.scale)
         costs = loss.cost(one.residuals), loss.cost(other.residuals)
         both = one.measured() & other.measured()
         apart = np.abs(one.point - other.point)[both].max(initial=0.0)
         return bool(apart < SAME_PLACE or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
 
-    def _keep(self, descent: _Descent) -> None:
+    def _keep(self, descent: Descent) -> None:
+        lowest = self._lowest
+        if lowest is not None and np.abs(lowest.point - descent.point).max() <= NEAR:
+            descent.move(lowest)  # another descent came by there
         self._fit = Fit(descent.point, descent.residuals, descent.jacobian, descent.cost,
                         descent.loss, descent.measured())
 
-    def _descend(self, here: _Descent, known: _Descent | None, rivals: Sequence[Observation]
-                 ) -> Generator[Floats, Sequence[Observation], _Descent]:
+    def _descend(self, here: Descent, known: Descent | None, rivals: Sequence[Observation]
+                 ) -> Generator[Floats, Sequence[Observation], Descent]:
         """
         Go down from where a descent stands.
 
@@ -274,18 +212,18 @@ class LeastSquares(PlannedSearch):
         if here.origin is None:
             yield from self._measure(here, np.flatnonzero(self._hints.excited))
         for _ in range(MOST_ITERATIONS):
-            step = self._step(here, np.inf)
-            gain = here.cost - self._predicted(here, step)
+            step = here.step(np.inf)
+            gain = here.cost - here.predicted(step)
             length = float(np.abs(step).max(initial=0.0))
             if known is not None and self._leads_nowhere(here, step, known):
                 return here
-            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.scale, 0.03))
+            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.scale, MOST_ROUGHNESS))
             if length <= DONE_STEP or gain <= visible * here.cost:
                 if here.known_here:
                     here.ended = (
                         f'converged: the next step would change no parameter by more than '
                         f'{DONE_STEP * 100:g} of 100' if length <= DONE_STEP else
-                        f'converged: the next step would lower the cost by less than {DONE_GAIN * 100:g} %')
+                        f'converged: the next step would lower the cost by less than {visible * 100:.2g} %')
                     return here
                 yield from self._measure(here, np.flatnonzero(here.measured()))
                 continue
@@ -294,7 +232,7 @@ class LeastSquares(PlannedSearch):
             moved = yield from self._try(here)
             gained = 1 - here.cost / before
             if here.known_here and reach < NEAR and gained <= visible:
-                here.ended = f'converged: the last step lowered the cost by less than {DONE_GAIN * 100:g} %'
+                here.ended = f'converged: the last step lowered the cost by less than {visible * 100:.2g} %'
                 return here
             slow = slow + 1 if gained < SLOW_GAIN else 0
             if slow and known is not None and known.loss.cost(here.residuals) > 2 * known.cost:
@@ -306,7 +244,8 @@ class LeastSquares(PlannedSearch):
         here.ended = f'stopped after {MOST_ITERATIONS} steps'
         return here
 
-    def _leads_nowhere(self, here: _Descent, step: Floats, known: _Descent) -> bool:
+    @staticmethod
+    def _leads_nowhere(here: Descent, step: Floats, known: Descent) -> bool:
         """Return whether a descent nears the known minimum, or flattens out above it."""
         target = here.point + step
         both = here.measured() & known.measured()
@@ -316,41 +255,15 @@ class LeastSquares(PlannedSearch):
         flat = float(np.abs(step).max(initial=0.0)) < SAME_PLACE / 3
         return bool(higher and (near or flat))
 
-    def _step(self, here: _Descent, radius: float) -> Floats:
-        """Return the (d,) step to the lowest point of the model within the cube and the radius."""
-        from scipy.optimize import lsq_linear
-
-        roots = here.loss.roots(here.residuals)
-        free = here.measured()
-        step = np.zeros(self._dimension)
-        least = np.maximum(-here.point, -radius)[free]
-        most = np.minimum(1 - here.point, radius)[free]
-        movable = most - least > 1e-12
-        columns = np.flatnonzero(free)[movable]
-        if not len(columns):
-            return step
-        matrix = roots[:, None] * here.jacobian[:, columns]
-        # Only the product matters to the solution: d rows in place of m.
-        upper, rest = _reduced(matrix, -roots * here.residuals)
-        damping = np.sqrt(DAMPING) * np.linalg.norm(matrix, axis=0).max() * 1e-2
-        upper = np.concatenate([upper, damping * np.eye(len(columns))])
-        rest = np.concatenate([rest, np.zeros(len(columns))])
-        solution = lsq_linear(upper, rest, (least[movable], most[movable]), method='bvls')
-        step[columns] = solution.x
-        return step
-
-    def _predicted(self, here: _Descent, step: Floats) -> float:
-        return here.loss.cost(here.residuals + here.jacobian @ step)
-
-    def _try(self, here: _Descent) -> Generator[Floats, Sequence[Observation], bool]:
+    def _try(self, here: Descent) -> Generator[Floats, Sequence[Observation], bool]:
         """Try the step within the radius and a shorter one; move to the better if it costs less."""
-        steps = [self._step(here, here.radius)]
-        shorter = self._step(here, here.radius * SPECULATIVE)
+        steps = [here.step(here.radius)]
+        shorter = here.step(here.radius * SPECULATIVE)
         if np.abs(steps[0] - shorter).max() > 0.1 * np.abs(steps[0]).max():
             steps.append(shorter)
         observations = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
         costs = [here.loss.cost(one.residuals) for one in observations]
-        gains = [here.cost - self._predicted(here, step) for step in steps]
+        gains = [here.cost - here.predicted(step) for step in steps]
         chosen = int(np.argmin(costs))
         base, before = here.point, here.residuals
         moved = costs[chosen] < here.cost
@@ -366,23 +279,11 @@ class LeastSquares(PlannedSearch):
             here.radius = min(float(np.abs(step).max()) for step in steps) / 4
         # The shortest first: the longest one's update then holds exactly.
         for one in sorted(observations, key=lambda seen: float(np.linalg.norm(seen.point - base))):
-            self._learn(here, one, base, before)
+            here.learn(one, base, before)
         here.updates = here.updates + 1 if moved else here.updates
         return moved
 
-    def _learn(self, here: _Descent, one: Observation, base: Floats, before: Floats) -> None:
-        """Update the Jacobian so that it predicts what a step gave (Broyden's rank-one update)."""
-        if one.residuals is None:
-            return
-        step = one.point - base
-        square = float(step @ step)
-        if square < 1e-16:
-            return
-        surprise = one.residuals - before - here.jacobian @ step
-        here.roughness = float(np.sqrt(np.mean(surprise ** 2)))
-        here.jacobian = here.jacobian + np.outer(surprise, step / square)
-
-    def _measure(self, here: _Descent, columns: NDArray[np.intp]
+    def _measure(self, here: Descent, columns: NDArray[np.intp]
                  ) -> Generator[Floats, Sequence[Observation], None]:
         """Measure columns of the Jacobian by finite differences at once; move where one costs less."""
         here.origin, here.updates = here.point, 0
@@ -395,7 +296,7 @@ class LeastSquares(PlannedSearch):
         if nearest is not None and here.loss.cost(nearest.residuals) < here.cost:
             here.move(nearest)
 
-    def _differences(self, here: _Descent, columns: NDArray[np.intp], sizes: Floats
+    def _differences(self, here: Descent, columns: NDArray[np.intp], sizes: Floats
                      ) -> Generator[Floats, Sequence[Observation], list[Observation]]:
         """Set columns of the Jacobian from steps of those sizes; the other way, where one fails."""
         seen: list[Observation] = []
@@ -412,19 +313,12 @@ class LeastSquares(PlannedSearch):
             sizes = -sizes / 2
         return seen
 
-    def _difference_steps(self, here: _Descent) -> Floats:
+    def _difference_steps(self, here: Descent) -> Floats:
         """Return the (d,) steps of finite differences that change the residuals visibly."""
         if not here.jacobian.any():
             return np.full(self._dimension, FIRST_STEP)
         wanted = min(max(VISIBLE * here.loss.scale, STEP_OVER_ROUGHNESS * here.roughness), here.loss.scale)
         # Only a parameter that is weak beside the others is moved far.
         most = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
-        return np.asarray(np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP))
-
-
-def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Return (d, d) and (d,) that have the same least-squares solution as (m, d) and (m,)."""
-    if len(matrix) <= matrix.shape[1]:
-        return matrix, right
-    q, r = np.linalg.qr(matrix)
-    return r, q.T @ right
+        sizes: Floats = np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP)
+        return sizes

@@ -77,9 +77,7 @@ class Hints:
     @property
     def excited(self) -> NDArray[np.bool_]:
         """(d,) True for the parameters that some trial excites; all where nothing is known."""
-        if len(self.excites):
-            return np.asarray(self.excites.any(axis=0))
-        return np.ones(len(self.start), dtype=np.bool_)
+        return np.logical_or.reduce(self.excites) if len(self.excites) else np.ones(len(self.start), np.bool_)
 
 
 class Search(Protocol):

@@ -73,7 +73,8 @@ class Sequential(PlannedSearch):
                 return 'stopped: no point of any line could be simulated'
             change = float(np.abs(at.point - before).max())
             if change <= DONE_CHANGE:
-                return f'converged: sweep {sweep} changed no parameter by more than {DONE_CHANGE * 100:g} of 100'
+                return (f'converged: sweep {sweep} changed no parameter by more than '
+                        f'{DONE_CHANGE * 100:g} of 100')
         return f'finished {len(HALF_WIDTHS)} sweeps over the parameters'
 
     def _line(self, at: Observation, k: int, half_width: float
