@@ -1,0 +1,114 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Compare the searches on the sample objects: how many evaluations, how exact, how often in a worse minimum.
+
+    python benchmark/searches.py [--seeds N] [--engine NAME] [SEARCH ...]
+
+For each object, the score to reach is the median of what 150 random parameter sets
+reach.  The cost of a result is the robust one that least squares minimises, so
+for the other searches it is not what they look for; it compares where they
+end.  The table is printed, and written to benchmark/results/searches.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from dlo_calibration.calibration import Evaluator
+from dlo_calibration.config import Options
+from dlo_calibration.engines import make_simulator
+from dlo_calibration.search import Observation, SEARCHES
+from dlo_calibration.search.huber import Huber
+from dlo_calibration.session import read_session, session_trials
+
+HERE = Path(__file__).resolve().parent
+BUDGET = 150
+SHOWN = ('flexibility', 'elasticity', 'friction')
+
+
+def search_with(evaluator: Evaluator, name: str, seed: int) -> tuple[list[Observation], Observation]:
+    """Return all observations of a search, and the one that it calls its result."""
+    search = SEARCHES[name](evaluator.space.dimension, seed)
+    seen: list[Observation] = []
+    while len(seen) < BUDGET:
+        points = search.ask(BUDGET - len(seen))
+        if not len(points):
+            break
+        evaluations = [evaluator.evaluate(0, point) for point in points]
+        search.tell([Observation(e.point, e.score, e.residuals) for e in evaluations])
+        seen.extend(Observation(e.point, e.score, e.residuals) for e in evaluations)
+    best = search.best
+    assert best is not None
+    return seen, next(one for one in seen if (one.point == best).all())
+
+
+def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
+    """Tabulate all searches on one object."""
+    session = read_session(HERE.parent / 'msg_samples' / name, None)
+    options = Options.of({**Options().flat(), **(session.options or {}), 'engine': engine})
+    trials, _ = session_trials(session, options)
+    evaluator = Evaluator(trials, options.space, make_simulator(options))
+    done = {one: [search_with(evaluator, one, seed) for seed in range(seeds)]
+            for one in dict.fromkeys(['random', *names])}
+    target = float(np.median([min(one.score for one in seen) for seen, _ in done['random']]))
+    residuals = {one: [best.residuals for _, best in found] for one, found in done.items()}
+    loss = min((Huber.of(each) for found in residuals.values() for each in found),
+               key=lambda candidate: candidate.scale)
+    lowest = min(loss.cost(each) for found in residuals.values() for each in found)
+    rows = []
+    for one in names:
+        scores = [np.minimum.accumulate([each.score for each in seen]) for seen, _ in done[one]]
+        reached = [int(np.argmax(score <= target)) + 1 if score[-1] <= target else BUDGET + 1
+                   for score in scores]
+        middle = float(np.median(reached))
+        worst = max(loss.cost(each) for each in residuals[one]) / lowest
+        points = 100 * np.array([best.point for _, best in done[one]])
+        shown = [list(evaluator.space.free).index(each) for each in SHOWN]
+        spread = ' | '.join(f'{points[:, k].mean():.1f} ± {points[:, k].std():.2f}' for k in shown)
+        rows.append(
+            f'| {name[-1]} | {one} | {target:.1f} | {f"{middle:g}" if middle <= BUDGET else "not"} '
+            f'| {max(reached) if max(reached) <= BUDGET else "not"} '
+            f'| {np.median([len(score) for score in scores]):g} '
+            f'| {np.median([score[-1] for score in scores]):.1f} | {spread} | {worst:.2f} |')
+    return rows
+
+
+def main() -> None:
+    """Make the table."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('searches', nargs='*', metavar='SEARCH', help=', '.join(SEARCHES))
+    parser.add_argument('--seeds', type=int, default=20)
+    parser.add_argument('--engine', default='compiled')
+    arguments = parser.parse_args()
+    names = arguments.searches or list(SEARCHES)
+    head = ('object', 'search', 'score to reach', 'evaluations until then, median', 'worst',
+            'evaluations in all', 'score', *SHOWN, 'worst cost / lowest')
+    rows = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
+    for k in range(1, 6):
+        rows += rows_of(f'object{k}', names, arguments.seeds, arguments.engine)
+    text = (f'# searches\n\n`python benchmark/searches.py --seeds {arguments.seeds} '
+            f'--engine {arguments.engine}`\n\n' + '\n'.join(rows) +
+            '\n\nParameters: mean and standard deviation over the seeds, on the 0..100 scale.\n')
+    print(text)
+    (HERE / 'results' / 'searches.md').write_text(text)
+
+
+if __name__ == '__main__':
+    main()
