@@ -79,8 +79,6 @@ def test_manifest_and_setup_give_the_same_version():
     assert manifest().findtext('version') == setup_value('version')
 
 
-
-
 @pytest.mark.parametrize('name', third_party_imports())
 def test_what_is_imported_is_declared(name):
     keys = {element.text for element in manifest().iterfind('exec_depend')}
