@@ -117,7 +117,7 @@ def expected_std(trial: Trial, space: ParameterSpace, simulator: Simulator, poin
     """
     assert uncertainty.covariance is not None
     matrix = sensitivity(trial, space, simulator, point, uncertainty.std, length)
-    information = np.linalg.inv(uncertainty.covariance) + matrix.T @ matrix / uncertainty.residual**2
+    information = np.linalg.inv(uncertainty.covariance) + matrix.T @ matrix / uncertainty.scale**2
     return np.sqrt(np.diag(np.linalg.inv(information)))
 
 

@@ -23,6 +23,7 @@ itself, and Bullet does contact and friction with everything else.
 from __future__ import annotations
 
 from contextlib import contextmanager
+import copy
 import ctypes
 import os
 from typing import Any, Iterator, Mapping, Sequence
@@ -306,6 +307,12 @@ class BulletSimulator:
             self._world = _World(layout, physical, self._time_step, radius, self._obstacles)
         rope = self._world.start(layout.places, points, layout.velocities, physical, touching)
         return roll_out(trial, layout, rope, self._settling)
+
+    def refined(self) -> BulletSimulator:
+        """Return one with twice the segments and half the time step."""
+        finer = copy.copy(self)
+        finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
+        return finer
 
     def close(self) -> None:
         """End the PyBullet client; the next trial starts another."""

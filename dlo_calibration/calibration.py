@@ -27,15 +27,18 @@ import weakref
 
 import numpy as np
 
+from dlo_calibration.advice import Advice
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+from dlo_calibration.examination import Examination, examine
+from dlo_calibration.noise import noise
 from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors, residuals, TrialScore
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Rollout, Simulator
 from dlo_calibration.trial import Trial
-from dlo_calibration.uncertainty import matters_below, spread_of_best, Uncertainty
+from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, matters_below, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
 
@@ -90,8 +93,11 @@ class ParameterEstimate:
     One found parameter.
 
     `value`, `std`, `lower`, `upper` are on the 0..100 scale; the others are the
-    same in `physical_unit`.  `identifiable` is False where the trials could
-    not tell its value.
+    same in `physical_unit`; the interval is one of 90 %.  `identifiable` is False
+    where the trials could not tell its value.
+
+    :param verdict: identifiable, weak, or not identifiable; see `uncertainty`.
+    :param note: what else is to be known, in words; empty where nothing is.
     """
 
     name: str
@@ -104,11 +110,19 @@ class ParameterEstimate:
     physical_upper: float
     physical_unit: str
     identifiable: bool
+    verdict: str = ''
+    note: str = ''
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """What a calibration found, and how."""
+    """
+    What a calibration found, and how.
+
+    :param chains: (g, n, 3) [m] the simulated goals of each trial.
+    :param examination: of the surroundings of what was found; None where there was no time for it.
+    :param advice: which action to observe next; None where none would help, or it was not asked for.
+    """
 
     space: ParameterSpace
     parameters: Mapping[str, ParameterEstimate]
@@ -123,6 +137,8 @@ class CalibrationResult:
     seed: int | None = None
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
+    examination: Examination | None = None
+    advice: Advice | None = None
 
     @property
     def values(self) -> dict[str, float]:
@@ -142,8 +158,18 @@ class CalibrationResult:
 
     @property
     def simulations(self) -> int:
-        """Rollouts that were simulated."""
-        return sum(len(self.trials) - evaluation.skipped for evaluation in self.evaluations)
+        """Rollouts that were simulated, by the search and by the examination."""
+        examined = 0 if self.examination is None else self.examination.evaluations
+        return examined * len(self.trials) + sum(
+            len(self.trials) - evaluation.skipped for evaluation in self.evaluations)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Combinations of parameters that the trials leave open, in words."""
+        if self.examination is None or not self.examination.regular:
+            return ()
+        return tuple(combination(self.space.free, vector)
+                     for vector in self.examination.uncertainty.undetermined)
 
     def physical(self) -> dict[str, float]:
         """Every parameter's physical value in SI units, for a rope like the observed one."""
@@ -246,13 +272,15 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
               clock: Callable[[], float] = time.monotonic,
               seed: int | None = None) -> CalibrationResult:
     """
-    Find the parameter set with the lowest average difference score.
+    Find the parameter set that fits the trials best, and how sure it is.
 
-    The result does not depend on `executor`: evaluations are told to the search
-    and to `on_evaluation` in the order asked.
+    What fits best is the search's word: the lowest average difference score, or the
+    lowest sum of squares.  The result does not depend on `executor`: evaluations are
+    told to the search and to `on_evaluation` in the order asked.
 
-    :param budget: number of evaluations.
-    :param on_evaluation: called with each finished one, in order.
+    :param budget: number of evaluations of the search; what is examined afterwards
+        (see `examination`) counts in `CalibrationResult.simulations` only.
+    :param on_evaluation: called with each finished one of the search, in order.
     :param should_stop: asked often; once True, the best so far is the result.
     :param executor: where evaluations run; None: here, one after the other.
     :param clock: seconds, for `CalibrationResult.seconds` only.
@@ -264,8 +292,43 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
         raise InputError('calibration', 'no trials', 'at least one complete trial',
                          'record an initial chain, an action and a goal chain first')
     started = clock()
-    evaluator = Evaluator(trials, space, simulator)
-    key = uuid.uuid4().hex  # of this calibration, on whichever machines
+
+    def everywhere(evaluator: Evaluator) -> _Everywhere:
+        return _Everywhere(evaluator, should_stop, executor)
+
+    evaluate = everywhere(Evaluator(trials, space, simulator))
+    kept, best, stopped = _searched(evaluate, search, budget, on_evaluation)
+    if best is None or not best.scores:
+        raise SimulationError('stopped before the first evaluation had finished' if best is None else
+                              f'none of {len(kept)} evaluations could be simulated: {best.failure}')
+    examination = None
+    if not stopped:
+        finer = simulator.refined()
+        try:
+            examination, best = _examined(
+                evaluate, None if finer is None else everywhere(Evaluator(trials, space, finer)), best)
+        except CancelledError:
+            stopped = True
+        finally:
+            if finer is not None:
+                finer.close()
+    reason = 'stopped on request' if stopped else \
+        search.stop_reason or f'budget of {budget} evaluations spent'
+    found = spread_of_best(kept, best.point)
+    if examination is not None:
+        found = examination.uncertainty if examination.regular else replace(
+            found, excited=examination.uncertainty.excited)
+    return CalibrationResult(
+        space=space, parameters=estimates(space, best, found), best=best, trials=tuple(trials),
+        chains=simulated_chains(trials, best), evaluations=tuple(kept), seconds=clock() - started,
+        search=search.name, engine=simulator.name, stop_reason=reason, seed=seed,
+        warnings=_warnings(best, kept), examination=examination)
+
+
+def _searched(evaluate: _Everywhere, search: Search, budget: int,
+              on_evaluation: Callable[[Evaluation], None] | None
+              ) -> tuple[list[Evaluation], Evaluation | None, bool]:
+    """Return all evaluations of a search, the one it calls the best, and whether it was stopped."""
     kept: list[Evaluation] = []
     best: Evaluation | None = None
     stopped = False
@@ -275,26 +338,46 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
         if not len(points):
             break
         batch: list[Evaluation] = []
-        for evaluation in _evaluations(evaluator, len(kept), points, limits, should_stop, executor, key):
+        for evaluation in evaluate(points, len(kept), limits):
             batch.append(evaluation)
-            if best is None or evaluation.score < best.score:
-                best = evaluation
             if on_evaluation is not None:
                 on_evaluation(evaluation)
         stopped = len(batch) < len(points)
-        if not stopped:
-            search.tell([Observation(e.point, e.score, e.residuals) for e in batch])
+        search.tell([Observation(e.point, e.score, e.residuals) for e in batch])
+        chosen = search.best
+        for evaluation in batch:
+            if best is None or best.residuals is None and evaluation.score < best.score or (
+                    evaluation.residuals is not None and chosen is not None
+                    and np.array_equal(evaluation.point, chosen)):
+                best = evaluation
         kept.extend(replace(evaluation, residuals=None) for evaluation in batch)
-    if best is None or not best.scores:
-        raise SimulationError('stopped before the first evaluation had finished' if best is None else
-                              f'none of {len(kept)} evaluations could be simulated: {best.failure}')
-    reason = 'stopped on request' if stopped else \
-        search.stop_reason or f'budget of {budget} evaluations spent'
-    return CalibrationResult(
-        space=space, parameters=estimates(space, best, spread_of_best(kept, best.point)),
-        best=best, trials=tuple(trials), chains=simulated_chains(trials, best),
-        evaluations=tuple(kept), seconds=clock() - started, search=search.name,
-        engine=simulator.name, stop_reason=reason, seed=seed, warnings=_warnings(best, kept))
+    return kept, best, stopped
+
+
+def _examined(evaluate: _Everywhere, finer: _Everywhere | None,
+              best: Evaluation) -> tuple[Examination, Evaluation]:
+    """
+    Return what is around the best evaluation, and that evaluation as it is reported.
+
+    A parameter that no trial tells anything about gets its default, not what it had by chance.
+
+    :raises CancelledError: when stopped.
+    """
+    trials, space = evaluate.evaluator.trials, evaluate.evaluator.space
+    assert best.residuals is not None
+    default = space.default_point()
+    examination = examine(
+        best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
+        evaluate.residuals, default=default, noise=noise(trials),
+        finer=None if finer is None else finer.residuals)
+    excited = examination.uncertainty.excited
+    point = np.where(excited, best.point, default)
+    if np.array_equal(point, best.point):
+        return examination, best
+    again = next(iter(evaluate(point[None, :], best.index)), None)
+    if again is None:
+        raise CancelledError
+    return replace(examination, evaluations=examination.evaluations + 1), best if again.failure else again
 
 
 def confirmed(result: CalibrationResult, simulator: Simulator,
@@ -333,17 +416,34 @@ def confirmed(result: CalibrationResult, simulator: Simulator,
                    warnings=(*result.warnings, words) if words else result.warnings)
 
 
-def estimates(space: ParameterSpace, best: Evaluation, spread: Uncertainty) -> dict[str, ParameterEstimate]:
-    """Return the parameters of the best evaluation with their spread, in both units."""
-    found = {}
+def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty) -> dict[str, ParameterEstimate]:
+    """Return the parameters of the best evaluation with their uncertainty, in both units."""
+    parameters = {}
     for k, name in enumerate(space.free):
-        value, lower, upper = (float(x) * SCALE for x in (best.point[k], spread.lower[k], spread.upper[k]))
+        value, lower, upper = (float(x) * SCALE for x in (best.point[k], found.lower[k], found.upper[k]))
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
-        found[name] = ParameterEstimate(
-            name, value, float(spread.std[k]) * SCALE, lower, upper, at_value,
-            min(at_lower, at_upper), max(at_lower, at_upper), unit, spread.verdicts[k] == 'identifiable')
-    return found
+        note = '' if found.excited[k] else 'no trial tells anything about it; it keeps its default'
+        if found.at_bound[k]:
+            note = 'at the end of its scale; the best value may lie beyond'
+        verdict = found.verdicts[k]
+        parameters[name] = ParameterEstimate(
+            name, value, float(found.std[k]) * SCALE, lower, upper, at_value, min(at_lower, at_upper),
+            max(at_lower, at_upper), unit, verdict == IDENTIFIABLE, verdict, note)
+    return parameters
+
+
+def combination(names: Sequence[str], vector: Floats) -> str:
+    """Return a combination of parameters in words, e.g. ``flexibility - 0.8 friction``."""
+    largest = float(np.abs(vector).max())
+    words = ''
+    for k in np.argsort(-np.abs(vector), kind='stable'):
+        share = float(vector[k]) / largest
+        if abs(share) >= INVOLVED:
+            sign = ('- ' if share < 0 else '+ ') if words else ('-' if share < 0 else '')
+            size = '' if abs(share) > 0.95 else f'{abs(share):.1f} '
+            words += f'{" " if words else ""}{sign}{size}{names[k]}'
+    return words
 
 
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
@@ -369,32 +469,51 @@ def _warnings(best: Evaluation, kept: Sequence[Evaluation]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _evaluations(evaluator: Evaluator, first: int, points: Floats, limits: Limits | None,
-                 should_stop: Callable[[], bool], executor: Executor | None,
-                 key: str) -> Iterator[Evaluation]:
-    """Evaluate points in order; end early, without a word, when asked to stop."""
-    if executor is None:
-        for k, point in enumerate(points):
-            try:
-                yield evaluator.evaluate(first + k, point, should_stop, limits)
-            except CancelledError:
-                return
-        return
-    futures: list[Future[Evaluation]] = [
-        executor.submit(_evaluate_elsewhere, key, evaluator, first + k, point, limits)
-        for k, point in enumerate(points)]
-    try:
-        for future in futures:
-            while not future.done():
-                if should_stop():
+class _Everywhere:
+    """Evaluates points in order, wherever the executor says; ends early, without a word, when stopped."""
+
+    def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
+                 executor: Executor | None) -> None:
+        self.evaluator = evaluator
+        self._should_stop = should_stop
+        self._executor = executor
+        self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
+
+    def __call__(self, points: Floats, first: int, limits: Limits | None = None) -> Iterator[Evaluation]:
+        """Evaluate (k, d) points, the first with the index `first`."""
+        if self._executor is None:
+            for k, point in enumerate(points):
+                try:
+                    yield self.evaluator.evaluate(first + k, point, self._should_stop, limits)
+                except CancelledError:
                     return
-                _wait(future)
-            if should_stop():
-                return
-            yield future.result()
-    finally:
-        for future in futures:
-            future.cancel()
+            return
+        futures: list[Future[Evaluation]] = [
+            self._executor.submit(_evaluate_elsewhere, self._key, self.evaluator, first + k, point, limits)
+            for k, point in enumerate(points)]
+        try:
+            for future in futures:
+                while not future.done():
+                    if self._should_stop():
+                        return
+                    _wait(future)
+                if self._should_stop():
+                    return
+                yield future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def residuals(self, points: Floats) -> Sequence[Floats | None]:
+        """
+        Return the residuals at (k, d) points; None where a simulation failed.
+
+        :raises CancelledError: when stopped.
+        """
+        found = [evaluation.residuals for evaluation in self(points, 0)]
+        if len(found) < len(points):
+            raise CancelledError
+        return found
 
 
 def _wait(future: Future[Evaluation]) -> None:

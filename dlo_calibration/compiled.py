@@ -21,6 +21,7 @@ PyBullet engine, without a call into another library for each node and step.
 
 from __future__ import annotations
 
+import copy
 from typing import Any, Mapping
 
 import numpy as np
@@ -169,6 +170,12 @@ class CompiledSimulator:
             level = None if self._table_height is None else resting_level(trial, self._table_height)
             self._known[id(trial)] = trial, Layout.of(trial, self._nodes), level
         return self._known[id(trial)][1:]
+
+    def refined(self) -> CompiledSimulator:
+        """Return one with twice the segments and half the time step."""
+        finer = copy.copy(self)
+        finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
+        return finer
 
     def close(self) -> None:
         """Forget the trials."""

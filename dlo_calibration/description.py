@@ -247,8 +247,10 @@ def _estimates(where: str, parameters: Any) -> dict[str, ParameterEstimate]:
             raise refused(where, element, f'the name {name!r} twice', 'each name once')
         if not 0 <= numbers['value'] <= SCALE:
             raise refused(where, element, f'value {numbers["value"]:g}', '0 to 100')
-        found[name] = ParameterEstimate(name=name, physical_unit=element.get('physical_unit'),
-                                        identifiable=element.get('identifiable') == 'true', **numbers)
+        found[name] = ParameterEstimate(
+            name, **numbers, physical_unit=element.get('physical_unit'),
+            identifiable=element.get('identifiable') == 'true', verdict=element.get('verdict', ''),
+            note=element.get('note', ''))
     return found
 
 

@@ -141,6 +141,10 @@ class ParameterSpace:
         """Return the (d,) point of the unit cube of free parameters on 0..100."""
         return np.array([values[name] / SCALE for name in self.free])
 
+    def default_point(self) -> NDArray[np.float64]:
+        """Return the (d,) point of the unit cube where nothing is found: what is fixed, else the default."""
+        return self.point({name: self.fixed.get(name, BY_NAME[name].default) for name in self.free})
+
     def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:
         """
         Return every parameter's physical value, by name.

@@ -77,5 +77,8 @@ class Simulator(Protocol):
             be represented.
         """
 
+    def refined(self) -> Simulator | None:
+        """Return one with twice the nodes and half the time step; None where it has no such thing."""
+
     def close(self) -> None:
         """Free what the simulator holds; it may be used again afterwards."""

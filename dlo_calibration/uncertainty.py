@@ -47,6 +47,7 @@ DEVIATIONS = 1.645  # that half such an interval has, of a normal distribution
 AT_BOUND = 0.002
 MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
 FEWEST_TRIALS = 3  # whose disagreement says something
+SMALLEST_RESIDUAL = 1e-9  # m; of a model that explains everything
 INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
 ROBUST = 1.5  # deviations beyond which a residual counts less (Huber, Robust Statistics, 1981, 4.5)
 CAPPED = 0.7785  # mean square of a standard normal value that is cut off there
@@ -77,6 +78,7 @@ class Uncertainty:
     :param at_bound: (d,) True where the best value is at an end of the scale.
     :param covariance: (d, d); None where only the spread of evaluations is known.
     :param residual: standard deviation of one coordinate's residual [m]; nan where not estimated.
+    :param scale: that residual as it counts, neighbours that err alike as one [m].
     """
 
     std: Floats
@@ -86,6 +88,7 @@ class Uncertainty:
     at_bound: NDArray[np.bool_]
     covariance: Floats | None = None
     residual: float = float('nan')
+    scale: float = float('nan')
 
     @property
     def verdicts(self) -> tuple[str, ...]:
@@ -171,7 +174,8 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
     right, matrix = weights * residuals, weights[:, None] * jacobian
     capped = weights**2 * residuals
     residual = float(np.sqrt(capped @ capped / CAPPED / max(1, len(residuals) - len(point))))
-    scale = residual * np.sqrt(independence(capped, shapes))
+    residual = max(residual, SMALLEST_RESIDUAL)
+    scale = residual * float(np.sqrt(independence(capped, shapes)))
     prior = np.eye(len(point)) * (scale / UNKNOWN_STD)**2
     information = matrix.T @ matrix
     with np.errstate(divide='ignore'):
@@ -192,7 +196,7 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
     upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
     at_bound = excited & ((point < AT_BOUND) | (point > 1 - AT_BOUND))
     return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited, at_bound,
-                       frozen_array(covariance), residual)
+                       frozen_array(covariance), residual, scale)
 
 
 def left_out(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]],

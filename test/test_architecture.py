@@ -29,7 +29,8 @@ ORDER = (
     # pure NumPy and SciPy
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
-    'search', 'confirmation', 'uncertainty', 'advice', 'calibration', '__init__', 'config', 'parameter_file',
+    'search', 'confirmation', 'uncertainty', 'examination', 'advice', 'calibration', '__init__', 'config',
+    'parameter_file',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',

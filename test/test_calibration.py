@@ -97,7 +97,7 @@ def test_every_evaluation_is_kept_and_reported_in_order():
     assert [evaluation.index for evaluation in result.evaluations] == list(range(120))
     assert [e.scores for e in result.evaluations] == [e.scores for e in seen]
     assert all(len(e.scores) == 2 for e in seen)
-    assert result.simulations == 240 - sum(e.skipped for e in seen)
+    assert result.simulations == 240 - sum(e.skipped for e in seen) + 2 * result.examination.evaluations
 
 
 def test_residuals_are_kept_of_the_best_only():
@@ -134,6 +134,7 @@ def test_a_search_that_finishes_early_says_why():
     class Finished:
         name = 'finished'
         limit = float('inf')
+        best = None
         stop_reason = 'it cannot get better'
 
         def __init__(self):
@@ -342,8 +343,9 @@ def test_abandoned_trials_are_not_simulated():
     simulate, done = simulator.simulate, []
     simulator.simulate = lambda trial, physical: done.append(trial.name) or simulate(trial, physical)
     result = found(simulator=simulator)
-    assert result.simulations == len(done) < 0.9 * 300
-    assert sum(np.isnan(e.scores).sum() for e in result.evaluations if e.scores) == 300 - len(done)
+    examined = 2 * result.examination.evaluations
+    assert result.simulations == len(done) < 0.9 * 300 + examined
+    assert sum(np.isnan(e.scores).sum() for e in result.evaluations if e.scores) == 300 + examined - len(done)
     assert result.warnings == ()
 
 
@@ -351,7 +353,7 @@ def test_a_failed_evaluation_counts_what_was_simulated():
     result = found(simulator=ToySimulator(fail_below=50.0), budget=8)
     failed = [e for e in result.evaluations if e.failure]
     assert all(e.skipped == 1 and not e.abandoned for e in failed)
-    assert result.simulations == 16 - len(failed)
+    assert result.simulations == 16 - len(failed) + 2 * result.examination.evaluations
 
 
 class OneThread(ToySimulator):

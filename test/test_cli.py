@@ -85,7 +85,7 @@ def test_fit_prints_one_document_with_every_key(run, session):
     assert list(found['parameters']) == list(Options().calibrate)
     assert all(set(one) == PARAMETER_KEYS for one in found['parameters'].values())
     assert (found['trials'], found['evaluations'], found['simulations']) == (2, 20, 40)
-    assert (found['engine'], found['search'], found['seed']) == ('toy', 'random', 1)
+    assert (found['engine'], found['search'], found['seed']) == ('toy', 'least_squares', 1)
     assert len(found['scores']) == 2
     assert found['score'] == pytest.approx(sum(found['scores']) / 2)
     assert found['mean_error_m'] <= found['rms_error_m'] <= found['max_error_m']
@@ -271,7 +271,8 @@ if __name__ == '__main__':
 def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, seconds, code):
     process = subprocess.Popen(
         [sys.executable, '-c', PROGRAM, str(seconds), 'fit', str(session), '--json',
-         '--evaluations', '5000', '--workers', str(workers), '--output', str(tmp_path / 'out')],
+         '--search', 'random', '--evaluations', '5000', '--workers', str(workers),
+         '--output', str(tmp_path / 'out')],
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()

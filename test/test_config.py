@@ -31,7 +31,7 @@ DECLARED = {declaration.name: declaration for declaration in declarations()}
 CONTRACT = {
     'mass': 0.0, 'table': True, 'table_height': 0.0,
     'calibrate': ['flexibility', 'elasticity', 'friction', 'self_collision'],
-    'search': 'random', 'evaluations': 150, 'grip_tolerance': 0.02, 'length_tolerance': 50.0,
+    'search': 'least_squares', 'evaluations': 150, 'grip_tolerance': 0.02, 'length_tolerance': 50.0,
     'start_after_trials': 0, 'output_directory': '.', 'record': True, 'release': True,
     'engine': 'auto', 'workers': 0,
 }

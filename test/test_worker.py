@@ -47,7 +47,7 @@ def finished(worker):
 
 
 def options(**flat):
-    return Options.of({'workers': 1, 'evaluations': 30, **flat})
+    return Options.of({'workers': 1, 'evaluations': 30, 'search': 'random', **flat})
 
 
 @pytest.mark.parametrize('workers', [1, 2])

@@ -60,6 +60,9 @@ class ToySimulator:
         chain = toy_goal(trial.initial.points, trial.hands, physical)
         return Rollout(np.stack([chain] * len(trial.goals)), (True,) * len(trial.goals), 1.0, 200)
 
+    def refined(self) -> None:
+        """Be as fine as it gets."""
+
     def close(self) -> None:
         """Hold nothing."""
 

@@ -1,0 +1,170 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Examination: what is looked at around the found parameters, once a search has ended.
+
+Beside the found point, each parameter is moved both ways; a finer simulation,
+the default parameters, and the optima without one trial after the other are
+simulated.  What that says about uncertainty is in `uncertainty`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Callable, Sequence
+
+import numpy as np
+
+from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.score import PointErrors
+from dlo_calibration.uncertainty import from_jacobian, left_out, optimum_shift, predictive_std, Uncertainty
+
+STEP = 0.03  # of the central differences, in the unit cube; contacts that come and go are smaller
+WIDEST = 0.25  # a parameter that is known badly is moved as far as it is unknown, but no further
+WIDENINGS = 2
+OUTLIER = 1.5  # standard deviations at which residuals are cut off
+ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
+MOST_FOLDS = 8  # of the cross-validation
+
+#: Takes (k, d) points, returns their residuals (m,) [m], None for a failure.
+Evaluate = Callable[[Floats], Sequence[Floats | None]]
+
+
+@dataclass(frozen=True)
+class Examination:
+    """
+    What was found around a point.
+
+    :param uncertainty: of the parameters.
+    :param jacobian: (m, d) derivative of the residuals there [m per unit cube].
+    :param regular: False where the search had not arrived at a minimum, so that
+        `uncertainty` does not hold.
+    :param noise: standard deviation of one coordinate of the observations, from
+        the roughness of the chains [m]; nan where they have too few points.
+    :param cross_validated: mean point error of trials that were left out of the
+        fit [m]; nan with one trial.
+    :param default_error: mean point error of the default parameters [m]; nan where they fail.
+    :param band: (p,) [m] how far each simulated goal point may lie elsewhere, one standard deviation.
+    :param evaluations: how many parameter sets were simulated for it.
+    """
+
+    uncertainty: Uncertainty
+    jacobian: Floats
+    regular: bool
+    noise: float
+    cross_validated: float
+    default_error: float
+    band: Floats
+    evaluations: int
+
+
+def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]], evaluate: Evaluate, *,
+            default: Floats, noise: float, finer: Evaluate | None = None) -> Examination:
+    """
+    Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
+
+    :param shapes: (goals, points) of each trial.
+    :param default: (d,) the default parameters.
+    :param noise: see `Examination`.
+    :param finer: simulates with more nodes and a smaller step; None: not examined.
+    """
+    count = 0
+
+    def residuals_at(points: Floats) -> Sequence[Floats | None]:
+        nonlocal count
+        count += len(points)
+        return evaluate(points)
+
+    dimension = len(point)
+    steps = np.full(dimension, STEP)
+    beside = np.concatenate([_beside(point, k, steps[k]) for k in range(dimension)] + [default[None, :]])
+    *seen, at_default = residuals_at(beside)
+    jacobian = np.stack([_column(residuals, point[k], beside[2 * k:2 * k + 2, k], seen[2 * k:2 * k + 2])
+                         for k in range(dimension)], axis=1)
+    for _ in range(WIDENINGS):
+        std = from_jacobian(point, residuals, jacobian, shapes, noise=noise).std
+        weak = np.flatnonzero(np.minimum(std, WIDEST) > 2 * steps)
+        if not len(weak):
+            break
+        steps[weak] = np.minimum(std[weak], WIDEST)
+        beside = np.concatenate([_beside(point, k, steps[k]) for k in weak])
+        seen = list(residuals_at(beside))
+        for j, k in enumerate(weak):
+            jacobian[:, k] = _column(residuals, point[k], beside[2 * j:2 * j + 2, k], seen[2 * j:2 * j + 2])
+    cross_validated = float('nan')
+    if len(shapes) > 1:
+        cross_validated = _cross_validated(point, residuals, jacobian, shapes, residuals_at)
+    shift = None
+    if finer is not None:  # last: a worker keeps one simulator at a time
+        count += 1
+        fine, = finer(point[None, :])
+        shift = np.ones(dimension) if fine is None else optimum_shift(residuals, fine, jacobian)
+    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift)
+    assert found.covariance is not None
+    return Examination(
+        uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,
+        regular=_arrived(residuals, jacobian, found), cross_validated=cross_validated,
+        default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
+        band=frozen_array(predictive_std(jacobian, found.covariance)), evaluations=count)
+
+
+def _beside(point: Floats, k: int | np.intp, step: float) -> Floats:
+    """Return the (2, d) points beside `point` in parameter k, within the cube."""
+    beside = np.tile(point, (2, 1))
+    beside[:, k] = np.clip(point[k] + np.array([-step, step]), 0.0, 1.0)
+    return beside
+
+
+def _column(residuals: Floats, value: float, values: Floats, seen: Sequence[Floats | None]) -> Floats:
+    """Return (m,) the derivative from both sides, or from the one that could be simulated."""
+    known = [(float(at), one) for at, one in zip(values, seen, strict=True)
+             if one is not None and at != value]
+    if len(known) < 2:
+        known.append((value, residuals))
+    if len(known) < 2:
+        return np.zeros_like(residuals)
+    (low, before), (high, after) = known
+    return np.asarray((after - before) / (high - low))
+
+
+def _arrived(residuals: Floats, jacobian: Floats, found: Uncertainty) -> bool:
+    """Tell whether the next Gauss-Newton step would stay among the values that the trials cannot tell apart."""
+    free = np.flatnonzero(found.excited & ~found.at_bound)
+    columns = jacobian[:, free]
+    capped = np.clip(residuals, -OUTLIER * found.residual, OUTLIER * found.residual)
+    information = columns.T @ columns + np.eye(len(free)) * found.residual**2
+    gradient = columns.T @ capped
+    return float(gradient @ np.linalg.solve(information, gradient)) <= ARRIVED * len(free) * found.scale**2
+
+
+def _cross_validated(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]],
+                     residuals_at: Evaluate) -> float:
+    """Return the mean point error of the trials at the optima of the others [m]."""
+    folds = _folds(shapes)
+    sizes = [sum(goals * points for goals, points in fold) for fold in folds]
+    moved = left_out(residuals, jacobian, [(size, 1) for size in sizes])
+    seen = residuals_at(np.clip(point + np.clip(moved, -WIDEST, WIDEST), 0.0, 1.0))
+    distances, at = [], 0
+    for size, one in zip(sizes, seen, strict=True):
+        if one is not None:
+            distances.append(np.linalg.norm(one[at:at + 3 * size].reshape(-1, 3), axis=1))
+        at += 3 * size
+    return float(np.concatenate(distances).mean()) if distances else float('nan')
+
+
+def _folds(shapes: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
+    """Divide the trials, in order, into as many folds as there are, but not too many."""
+    parts = np.array_split(np.arange(len(shapes)), min(len(shapes), MOST_FOLDS))
+    return [[shapes[k] for k in part] for part in parts]
