@@ -224,17 +224,18 @@ def near_pairs(points: Floats, middles: Floats, half: Floats, apart: float, diam
     :param pairs: (S (S - 1) / 2, 2) to write to.
     :returns: how many there are.
     """
-    count = 0
-    for i in range(len(half)):
-        x = (points[i, 0] + points[i + 1, 0]) / 2
-        y = (points[i, 1] + points[i + 1, 1]) / 2
-        z = (points[i, 2] + points[i + 1, 2]) / 2
-        for j in range(i + 1, len(half)):
-            if middles[j] - middles[i] - half[j] - half[i] <= apart:
-                continue
-            dx = (points[j, 0] + points[j + 1, 0]) / 2 - x
-            dy = (points[j, 1] + points[j + 1, 1]) / 2 - y
-            dz = (points[j, 2] + points[j + 1, 2]) / 2 - z
+    count, segments = 0, len(half)
+    x, y, z = np.empty(segments), np.empty(segments), np.empty(segments)
+    for i in range(segments):
+        x[i] = (points[i, 0] + points[i + 1, 0]) / 2
+        y[i] = (points[i, 1] + points[i + 1, 1]) / 2
+        z[i] = (points[i, 2] + points[i + 1, 2]) / 2
+    for i in range(segments):
+        first = i + 1
+        while first < segments and middles[first] - middles[i] - half[first] - half[i] <= apart:
+            first += 1
+        for j in range(first, segments):
+            dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
             far = stretch * (half[i] + half[j] + diameter) + reach
             if dx * dx + dy * dy + dz * dz <= far * far:
                 pairs[count, 0] = i
