@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation, Slerp
 
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError
@@ -113,6 +112,10 @@ class Hand:
         :returns: (m, 3) positions [m] and (m, 3, 3) rotation matrices since it closed.
         """
         times = np.clip(np.atleast_1d(np.asarray(at, dtype=float)), self.start, self.end)
+        if (self.orientations == NO_ROTATION).all():
+            return self.positions_at(times), np.tile(np.eye(3), (len(times), 1, 1))
+        from scipy.spatial.transform import Rotation, Slerp  # a quarter of a second, that few need
+
         turns = Rotation.from_quat(self.orientations)
         turned = Slerp(self.times, turns)(times) if len(self.times) > 1 else turns[np.zeros(len(times), int)]
         return self.positions_at(times), (turned * turns[0].inv()).as_matrix()

@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Sequence, Union
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from dlo_calibration.action import Hand
 from dlo_calibration.chain import Chain, Floats
@@ -116,5 +115,7 @@ def _poses(hand: Hand, times: Floats) -> tuple[Floats, Floats]:
     """Return (k, 3) positions [m] and (k, 4) quaternions of a hand."""
     if len(hand.times) == len(times):
         return hand.positions, hand.orientations
+    from scipy.spatial.transform import Rotation, Slerp  # slow to load
+
     turns = Rotation.from_quat(hand.orientations)
     return hand.positions_at(times), np.asarray(Slerp(hand.times, turns)(times).as_quat())

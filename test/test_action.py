@@ -37,6 +37,12 @@ def test_positions_between_before_and_after_the_waypoints():
     assert turns == pytest.approx(np.tile(np.eye(3), (7, 1, 1)))
 
 
+def test_a_hand_that_hardly_turns_is_not_taken_for_one_that_does_not():
+    hand = Hand('h', (0,), [0, 2], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0, 1], about('z', 1e-6)])
+    turn = Rotation.from_matrix(hand.poses(2.0)[1][0])
+    assert turn.as_rotvec(degrees=True)[2] == pytest.approx(1e-6)
+
+
 def test_a_hand_turns_at_constant_speed_on_the_shortest_way():
     hand = Hand('h', (0,), [0.0, 1.0], np.zeros((2, 3)), [about('z', 170), about('z', -170)])
     for share in (0, 0.25, 0.5, 1):

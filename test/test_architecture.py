@@ -15,6 +15,7 @@
 """Imports run one way, and heavy libraries stay where they belong."""
 
 import ast
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -108,9 +109,47 @@ def test_only_its_owner_imports(name):
                  if any(one == name or one.startswith(f'{name}.') for one in imported(file))}
     assert importers - ONLY[name] == set()
 
+#: What takes long to load; then commands, and what of that each needs.
+SLOW = {'matplotlib', 'numba', 'pybullet', 'rclpy', 'scipy'}
+LOADED = (
+    (('--help',), set()),
+    (('info', 'msg_samples/object1'), set()),
+    (('info', 'msg_samples/xml/named_actions.xml'), set()),
+    (('plot', 'msg_samples/object1'), {'matplotlib'}),
+)
+
 
 def test_importing_the_package_loads_no_heavy_library():
     program = f'import sys, {PACKAGE}; print(*(name for name in {NOT_LOADED} if name in sys.modules))'
     done = subprocess.run([sys.executable, '-c', program], cwd=FOLDER.parent, check=True,
                           capture_output=True, text=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize('words, needed', LOADED, ids=[' '.join(words) for words, _ in LOADED])
+def test_a_command_loads_only_what_it_needs(words, needed, tmp_path):
+    words = [FOLDER.parent / word if word.startswith('msg_samples') else word for word in words]
+    done = subprocess.run([sys.executable, '-X', 'importtime', '-m', PACKAGE, *words], cwd=tmp_path,
+                          env={**os.environ, 'PYTHONPATH': str(FOLDER.parent)}, check=True,
+                          capture_output=True, text=True)
+    loaded = {line.rpartition('|')[2].strip().split('.')[0] for line in done.stderr.splitlines()}
+    assert PACKAGE in loaded
+    assert loaded & SLOW == needed
+
+
+def test_the_compiled_engine_loads_no_other_slow_library():
+    program = f"""
+import sys
+from {PACKAGE} import ParameterSpace
+from {PACKAGE}.compiled import CompiledSimulator
+from {PACKAGE}.config import Options
+from {PACKAGE}.session import read_session, session_trials
+trials, _ = session_trials(read_session('msg_samples/object1'), Options())
+CompiledSimulator().simulate(trials[0], ParameterSpace().physical({{}}, 0.6))
+print(*sys.modules)
+"""
+    done = subprocess.run([sys.executable, '-c', program], cwd=FOLDER.parent, check=True,
+                          capture_output=True, text=True)
+    loaded = set(done.stdout.split())
+    assert loaded & (SLOW - {'scipy'}) == {'numba'}
+    assert 'scipy.spatial' not in loaded  # Numba itself needs the rest of SciPy
