@@ -33,7 +33,7 @@ help:
 	  make demo    calibrate a sample session with the real node, and draw the result
 	  make test    run all tests
 	  make lint    run the checks of style, types, imports and packaging alone
-	  make bench   measure the speed of simulation and search
+	  make bench   measure speed, memory and start-up, and compare the engines
 	  make clean   remove .venv and everything that was built
 	END
 
@@ -47,7 +47,10 @@ lint: $(STAMP)
 	@$(PYTHON) -m pytest $(LINT)
 
 bench: $(STAMP)
-	@$(PYTHON) -m pytest benchmark
+	@$(PYTHON) -c 'import mujoco' 2>/dev/null ||
+	  $(PYTHON) -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	$(PYTHON) -m pytest benchmark
+	$(PYTHON) benchmark/agreement.py
 
 clean:
 	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -64,6 +64,11 @@ setup(
         'scipy>=1.11',
     ],
     extras_require={
+        'bench': [
+            'mujoco>=3.2,<4',
+            'pytest>=7.4',
+            'pytest-benchmark>=4.0',
+        ],
         # For simulation on several machines.
         'distributed': ['distributed>=2023.12'],
         # On a machine with ROS 2 Jazzy these come from its own packages.

@@ -12,44 +12,138 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Rounds per second and core: `make bench`."""
+"""How fast both engines simulate, and what a rollout's time is spent on: `make bench`."""
 
-from pathlib import Path
+import time
 
+from figures import SAMPLES, side_by_side, table, write
+import numpy as np
 import pytest
 
+from dlo_calibration import kernels
 from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.session import read_session, session_trials
 
-SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
-RESULTS = Path(__file__).resolve().parent / 'results' / 'speed.md'
+NODES = (12, 30, 60, 120)
+ROUNDS = 7
+ACTIONS = ('place_end', 'drag_quarter', 'hold_middle', 'two_hands')
+VALUES = {'flexibility': 66.7, 'friction': 69.7}  # the truth of object 1
+HOW = ('Object 1; a settled round is one trial simulated until the DLO has come to rest. Shortest of '
+       f'{ROUNDS} repetitions, in which the engines take turns in one process; its processor time.')
 
 
-@pytest.fixture(scope='module')
-def rows():
-    """Collect the rows of a table, and write it to results/speed.md."""
-    found = []
-    yield found
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text('# speed\n\n`make bench`: object 1, four trials, one core\n\n'
-                       '| nodes | settled rounds per second | microseconds per step |\n|---|---|---|\n'
-                       + '\n'.join(found) + '\n')
-
-
-@pytest.mark.parametrize('nodes', [30, 60, 120])
-def test_settled_rounds(benchmark, nodes, rows):
-    """A round: one trial of object 1 simulated until it has settled; the four trials in turn."""
+def object1():
+    """Return the four trials of object 1 and its physical parameters."""
     session = read_session(SAMPLES / 'object1')
     options = Options.of(session.options)
     trials, _ = session_trials(session, options)
-    simulator = BulletSimulator(nodes=nodes)
-    physical = options.space.physical({'flexibility': 66.7, 'friction': 69.7}, trials[0].initial.length)
-    steps = sum(simulator.simulate(trial, physical).steps for trial in trials)
-    benchmark.pedantic(lambda: [simulator.simulate(trial, physical) for trial in trials], rounds=5)
-    seconds = benchmark.stats.stats.median
-    benchmark.extra_info['rounds per second'] = round(len(trials) / seconds, 1)
-    benchmark.extra_info['microseconds per step'] = round(1e6 * seconds / steps, 1)
-    rows.append(f'| {nodes} | {len(trials) / seconds:.1f} | {1e6 * seconds / steps:.0f} |')
-    print(f'\n{rows[-1]}')
-    simulator.close()
+    return trials, options.space.physical(VALUES, trials[0].initial.length)
+
+
+@pytest.fixture(scope='module')
+def tables():
+    """Collect rows, and write them when all are there."""
+    speeds, trials, parts = [], [], []
+    yield speeds, trials, parts
+    if len(parts) < len(NODES) or len(trials) < len(ACTIONS):
+        return  # a part was measured alone
+    nodes = np.log([row[0] for row in speeds])
+    growth = [np.polyfit(nodes, np.log([row[column] for row in speeds]), 1)[0] for column in (4, 5)]
+    last = np.log(speeds[-1][5] / speeds[-2][5]) / (nodes[-1] - nodes[-2])
+    rounded = [[row[0], *(f'{x:.1f}' for x in row[1:])] for row in speeds]
+    write('speed', 'make bench', HOW, '\n\n'.join([
+        table(['nodes', 'bullet, rounds per second', 'compiled, rounds per second', 'ratio',
+               'bullet, µs per step', 'compiled, µs per step'], rounded),
+        f'From {NODES[0]} to {NODES[-1]} nodes the time of a step grows with the nodes to the power of '
+        f'{growth[0]:.2f} (bullet) and {growth[1]:.2f} (compiled; {last:.2f} from {NODES[-2]} to '
+        f'{NODES[-1]}).',
+        table(['trial, 31 nodes', 'bullet, ms', 'compiled, ms', 'ratio', 'steps'], trials),
+        'What a compiled round is spent on, in µs:',
+        table(['nodes', 'whole', 'Python', 'table of distances', 'self-contact', 'rod and table',
+               'Python, share', 'self-contact, share'], parts)]))
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize('nodes', NODES)
+def test_settled_rounds(benchmark, nodes, tables):
+    trials, physical = object1()
+    engines = {'bullet': BulletSimulator(nodes=nodes), 'compiled': CompiledSimulator(nodes=nodes)}
+    steps = {name: sum(engine.simulate(trial, physical).steps for trial in trials)
+             for name, engine in engines.items()}
+    seconds = side_by_side(benchmark, {
+        name: lambda engine=engine: [engine.simulate(trial, physical) for trial in trials]
+        for name, engine in engines.items()}, ROUNDS)
+    rate = {name: len(trials) / seconds[name] for name in engines}
+    tables[0].append([nodes, rate['bullet'], rate['compiled'], rate['compiled'] / rate['bullet'],
+                      *(1e6 * seconds[name] / steps[name] for name in engines)])
+    engines['bullet'].close()
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize('number', range(len(ACTIONS)), ids=ACTIONS)
+def test_trial(benchmark, number, tables):
+    trials, physical = object1()
+    engines = {'bullet': BulletSimulator(), 'compiled': CompiledSimulator()}
+    steps = {name: engine.simulate(trials[number], physical).steps for name, engine in engines.items()}
+    seconds = side_by_side(benchmark, {
+        name: lambda engine=engine: engine.simulate(trials[number], physical)
+        for name, engine in engines.items()}, 2 * ROUNDS)
+    tables[1].append([ACTIONS[number], f'{1e3 * seconds["bullet"]:.1f}', f'{1e3 * seconds["compiled"]:.2f}',
+                      f'{seconds["bullet"] / seconds["compiled"]:.0f}', steps['compiled']])
+    engines['bullet'].close()
+
+
+class Watch:
+    """Measures the time that a kernel takes, in place of which it is called."""
+
+    def __init__(self, kernel, prepare=lambda arguments: None):
+        self.kernel, self.prepare, self.seconds = kernel, prepare, 0.0
+
+    def __call__(self, *arguments):
+        self.prepare(arguments)
+        begun = time.process_time()
+        try:
+            return self.kernel(*arguments)
+        finally:
+            self.seconds += time.process_time() - begun
+
+
+def look_for_no_contact(arguments):
+    """Change the arguments of `kernels.advance` so that no pair of segments is ever looked at."""
+    *_, constants = arguments
+    constants[8:10] = np.inf, 0
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize('nodes', NODES)
+def test_parts(benchmark, nodes, tables, monkeypatch):
+    """The kernels are measured where Python calls them; self-contact, as what its absence saves."""
+    trials, physical = object1()
+    simulator = CompiledSimulator(nodes=nodes)
+    advance, start = kernels.advance, kernels.start_distances
+    whole, kernel, distances, contact = [], [], [], []
+
+    def measure(prepare=lambda arguments: None):
+        watches = Watch(advance, prepare), Watch(start)
+        monkeypatch.setattr(kernels, 'advance', watches[0])
+        monkeypatch.setattr(kernels, 'start_distances', watches[1])
+        begun = time.process_time()
+        steps = sum(simulator.simulate(trial, physical).steps for trial in trials)
+        return time.process_time() - begun, *(watch.seconds for watch in watches), steps
+
+    def take():
+        total, stepping, starting, steps = measure()
+        _, free, _, free_steps = measure(look_for_no_contact)
+        whole.append(total)
+        kernel.append(stepping)
+        distances.append(starting)
+        contact.append(stepping - free * steps / free_steps)
+
+    benchmark.pedantic(take, rounds=2 * ROUNDS)
+    total, stepping, starting, touching = (1e6 * float(np.median(x)) / len(trials)
+                                           for x in (whole, kernel, distances, contact))
+    python = total - stepping - starting
+    tables[2].append([nodes, *(f'{x:.0f}' for x in (total, python, starting, touching, stepping - touching)),
+                      *(f'{x / total:.0%}' for x in (python, touching))])

@@ -1,0 +1,82 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Figures: measured side by side, and written into tables."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import platform
+import re
+import time
+from typing import Any, Callable, Iterable, Mapping, Sequence
+
+HERE = Path(__file__).resolve().parent
+SAMPLES = HERE.parent / 'msg_samples'
+
+
+def side_by_side(benchmark: Any, calls: Mapping[str, Callable[[], object]], rounds: int,
+                 clock: Callable[[], float] = time.process_time) -> dict[str, float]:
+    """
+    Return the shortest time [s] of each call; they take turns, so that all meet the same disturbances.
+
+    :param benchmark: pytest-benchmark's fixture, which shows the last of the calls.
+    :param clock: `process_time` leaves out what other programs take; `perf_counter` where several
+        processes work.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+
+    def take(name: str) -> None:
+        begun = clock()
+        calls[name]()
+        times[name].append(clock() - begun)
+
+    *others, last = calls
+    benchmark.pedantic(take, (last,), setup=lambda: [take(name) for name in others] and None, rounds=rounds)
+    shortest = {name: min(found) for name, found in times.items()}
+    benchmark.extra_info.update({f'{name} [s]': seconds for name, seconds in shortest.items()})
+    return shortest
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table in Markdown."""
+    return '\n'.join(f'| {" | ".join(map(str, row))} |' for row in (columns, ['---'] * len(columns), *rows))
+
+
+def machine() -> str:
+    """Say what was measured on."""
+    model = re.search(r'model name\s*: (.*)', Path('/proc/cpuinfo').read_text(encoding='utf-8'))
+    name = model[1] if model else platform.processor() or platform.machine()
+    return (f'{name}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}; load average '
+            f'of the last minute {os.getloadavg()[0]:.1f}.')
+
+
+def write(name: str, command: str, how: str, text: str) -> None:
+    """
+    Write results/NAME.md, and the same between the markers of that name in README.md.
+
+    :param command: that makes the figures.
+    :param how: in one or two sentences.
+    """
+    target = HERE / 'results' / f'{name}.md'
+    target.parent.mkdir(exist_ok=True)
+    target.write_text(f'# {name}\n\n`{command}`\n\n{how} {machine()}\n\n{text}\n', encoding='utf-8')
+    readme = HERE / 'README.md'
+    before = readme.read_text(encoding='utf-8')
+    after, count = re.subn(rf'(<!-- {name} begins -->\n).*?(<!-- {name} ends -->)',
+                           lambda found: f'{found[1]}\n{text}\n\n{found[2]}', before, flags=re.DOTALL)
+    assert count == 1, f'README.md has {count} places for {name}'
+    readme.write_text(after, encoding='utf-8')
+    print(f'\n{text}')

@@ -1,0 +1,87 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether memory stays flat over many rounds: `make bench`."""
+
+import os
+from pathlib import Path
+
+from figures import SAMPLES, table, write
+import numpy as np
+import pytest
+
+from dlo_calibration import SimulationError
+from dlo_calibration.config import Options
+from dlo_calibration.pool import ProcessExecutor
+from dlo_calibration.session import read_session, session_trials
+
+#: engine -> rounds
+ROUNDS = {'compiled': 10_000, 'bullet': 1_000}
+LOOKS = 100
+WARM = 0.2  # share of the rounds that fill caches and pools
+
+
+def resident():
+    """Return the memory of this process that is in use [kB]."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 1000
+
+
+def memory(name, rounds):
+    """Return rounds done and kB at each look, of rounds with random parameters."""
+    if name == 'compiled':
+        from dlo_calibration.compiled import CompiledSimulator as Engine
+    else:
+        from dlo_calibration.bullet import BulletSimulator as Engine
+    session = read_session(SAMPLES / 'object1')
+    options = Options.of(session.options)
+    trials, _ = session_trials(session, options)
+    simulator, generator, looks = Engine(), np.random.default_rng(1), []
+    for k in range(rounds):
+        values = options.space.values(generator.uniform(size=options.space.dimension))
+        try:
+            physical = options.space.physical(values, trials[0].initial.length)
+            simulator.simulate(trials[k % len(trials)], physical)
+        except SimulationError:
+            pass
+        if (k + 1) % (rounds // LOOKS) == 0:
+            looks.append((k + 1, resident()))
+    return looks
+
+
+@pytest.fixture(scope='module')
+def rows():
+    """Collect rows, and write them when all are there."""
+    found = []
+    yield found
+    if len(found) == len(ROUNDS):
+        write('memory', 'make bench', 'Rounds (one settled trial) of object 1 with random parameters, in a '
+              f'process of their own; resident memory, at {LOOKS} instants. The slope is that of a line '
+              f'through those after the first {WARM:.0%} of the rounds.',
+              table(['engine', 'rounds', f'MB after {WARM:.0%}', 'MB at the end',
+                     'slope, kB per 1000 rounds', 'all rounds, s'], found))
+
+
+@pytest.mark.parametrize('engine', ROUNDS)
+def test_memory(benchmark, engine, rows):
+    executor = ProcessExecutor(1)
+    try:
+        looks = np.array(benchmark.pedantic(
+            lambda: executor.submit(memory, engine, ROUNDS[engine]).result(), rounds=1))
+    finally:
+        executor.close()
+    warm = looks[looks[:, 0] > WARM * ROUNDS[engine]]
+    slope = np.polyfit(warm[:, 0], warm[:, 1], 1)[0]
+    rows.append([engine, ROUNDS[engine], f'{warm[0, 1] / 1000:.1f}', f'{warm[-1, 1] / 1000:.1f}',
+                 f'{1000 * slope:.1f}', f'{benchmark.stats.stats.max:.0f}'])

@@ -1,0 +1,165 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How much faster several processes are, and where the time of a whole `fit` goes: `make bench`."""
+
+from itertools import pairwise
+import json
+import os
+import subprocess
+import sys
+import time
+
+from figures import HERE, SAMPLES, side_by_side, table, write
+import pytest
+
+from dlo_calibration import calibrate
+from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.compiled import CompiledSimulator
+from dlo_calibration.config import ENGINES, Options
+from dlo_calibration.pool import cores, ProcessExecutor
+from dlo_calibration.search import RandomSearch
+from dlo_calibration.session import read_session, session_trials
+
+ROUNDS = 3
+EVALUATIONS = 150
+WORKERS = (1, 2)
+#: engine -> class, evaluations
+MEASURED = {'compiled': (CompiledSimulator, 150), 'bullet': (BulletSimulator, 6)}
+STAGES = {'imports': 'interpreter and imports', 'reading': 'session',
+          'first': 'processes until the first evaluation', 'rounds': 'the other evaluations',
+          'closing': 'end of the calibration', 'writing': 'report, pictures, files',
+          'end': 'end of the interpreter'}
+
+
+@pytest.fixture(scope='module')
+def processes():
+    """Collect rows, and write them when all are there."""
+    rows = []
+    yield rows
+    if len(rows) == len(MEASURED) * len(WORKERS):
+        write('processes', 'make bench', '`calibrate` on the four trials of object 1, random search; '
+              f'shortest wall clock of {ROUNDS} repetitions, '
+              'in which the numbers of processes take turns. Ready '
+              f'processes have simulated before. {cores()} cores may be used.',
+              table(['engine', 'evaluations', 'processes', 'seconds, ready processes', 'speed-up',
+                     'efficiency', 'seconds with their start'], rows))
+
+
+def sample():
+    """Return trials and parameter space of object 1."""
+    session = read_session(SAMPLES / 'object1')
+    options = Options.of(session.options)
+    return session_trials(session, options)[0], options.space
+
+
+@pytest.mark.benchmark(timer=time.perf_counter)
+@pytest.mark.parametrize('engine', MEASURED)
+def test_processes(benchmark, engine, processes):
+    trials, space = sample()
+    make, evaluations = MEASURED[engine]
+    ready = {workers: ProcessExecutor(workers) for workers in WORKERS}
+
+    def search(executor, budget=evaluations):
+        calibrate(trials, space, make(), RandomSearch(space.dimension, seed=1), budget=budget,
+                  executor=executor, seed=1)
+
+    def with_start(workers):
+        executor = ProcessExecutor(workers)
+        try:
+            search(executor)
+        finally:
+            executor.close()
+
+    try:
+        for workers, executor in ready.items():
+            search(executor, 4 * workers)
+        calls = {f'{workers}': lambda executor=executor: search(executor)
+                 for workers, executor in ready.items()}
+        calls |= {f'{workers} with start': lambda workers=workers: with_start(workers)
+                  for workers in WORKERS}
+        seconds = side_by_side(benchmark, calls, ROUNDS, time.perf_counter)
+    finally:
+        for executor in ready.values():
+            executor.close()
+    for workers in WORKERS:
+        faster = seconds[f'{WORKERS[0]}'] / seconds[f'{workers}']
+        processes.append([engine, evaluations, workers, f'{seconds[f"{workers}"]:.2f}', f'{faster:.2f}',
+                          f'{faster / workers:.0%}', f'{seconds[f"{workers} with start"]:.2f}'])
+
+
+PROGRAM = """
+import json, sys, time
+from dlo_calibration import cli
+marks = {'imports': time.time()}
+calibrate_with = cli.calibrate_with
+def watched(trials, options, make_simulator, on_evaluation, should_stop):
+    marks['reading'] = time.time()
+    def take(evaluation):
+        marks.setdefault('first', time.time())
+        marks['rounds'] = time.time()
+        on_evaluation(evaluation)
+    try:
+        return calibrate_with(trials, options, make_simulator, take, should_stop)
+    finally:
+        marks['closing'] = time.time()
+cli.calibrate_with = watched
+code = cli.main(sys.argv[1:])
+marks['writing'] = time.time()
+sys.stderr.write(json.dumps(marks))
+sys.exit(code)
+"""
+
+
+def fit(folder, engine, workers):
+    """Return seconds of each stage of `fit` in a fresh process."""
+    begun = time.time()
+    done = subprocess.run(
+        [sys.executable, '-c', PROGRAM, 'fit', str(SAMPLES / 'object1'), '--output', str(folder), '--json',
+         '--engine', engine, '--search', 'random', '--evaluations', str(EVALUATIONS),
+         '--workers', str(workers), '--seed', '1'],
+        env={**os.environ, 'PYTHONPATH': str(HERE.parent)}, capture_output=True, text=True)
+    ended = time.time()
+    assert done.returncode == 0, done.stderr
+    marks = {**json.loads(done.stderr.splitlines()[-1]), 'end': ended}
+    times = [begun, *(marks[stage] for stage in STAGES)]
+    return {**{stage: after - before for stage, (before, after) in zip(STAGES, pairwise(times), strict=True)},
+            'whole': ended - begun}
+
+
+def test_fit(benchmark, tmp_path, fits):
+    engine = next(name for name in MEASURED if name in ENGINES)
+    found = {workers: [] for workers in WORKERS}
+    fit(tmp_path / 'warm', engine, WORKERS[-1])  # fills the caches
+
+    def take():
+        for workers, stages in found.items():
+            stages.append(fit(tmp_path / f'{workers}', engine, workers))
+
+    benchmark.pedantic(take, rounds=ROUNDS)
+    for workers, repetitions in found.items():
+        best = min(repetitions, key=lambda stages: stages['whole'])
+        fits.append([engine, workers, *(f'{best[stage]:.2f}' for stage in ('whole', *STAGES))])
+
+
+@pytest.fixture(scope='module')
+def fits():
+    """Collect rows, and write them."""
+    rows = []
+    yield rows
+    if rows:
+        write('fit', 'make bench', '`dlo-calibration fit msg_samples/object1 --search random --evaluations '
+              f'{EVALUATIONS} --output DIR`, a process of its own each time, caches warm; seconds of wall '
+              f'clock, of the fastest of {ROUNDS} repetitions.',
+              table(['engine', 'processes', 'whole', *STAGES.values()], rows))

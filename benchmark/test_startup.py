@@ -1,0 +1,84 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How long commands take to start, and what they load: `make bench`."""
+
+from importlib.util import find_spec
+import os
+import signal
+import subprocess
+import sys
+import time
+
+from figures import HERE, SAMPLES, table, write
+import pytest
+
+ROUNDS = 5
+SLOW = ('numpy', 'scipy', 'scipy.spatial', 'scipy.optimize', 'matplotlib', 'numba', 'pybullet', 'rclpy')
+COMMANDS = {
+    'dlo-calibration --help': ('dlo_calibration', '--help'),
+    'dlo-calibration info SESSION': ('dlo_calibration', 'info', str(SAMPLES / 'object1')),
+    'calibrator --help': ('dlo_calibration.calibrator', '--help'),
+    'calibrator, until it is ready': ('dlo_calibration.calibrator',),
+}
+READY = 'collecting trials'  # says the node
+ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
+PATIENCE = 60  # s
+
+
+def finish(words, *options):
+    """Return what a command says on stderr when it has ended; the node is ended when it is ready."""
+    process = subprocess.Popen([sys.executable, *options, '-m', *words], env=ENVIRONMENT, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    said = []
+    for line in process.stdout:
+        said.append(line)
+        if READY in line:
+            process.send_signal(signal.SIGINT)
+            said.append(time.perf_counter())
+            break
+    else:
+        said.append(time.perf_counter())
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, said
+    return said
+
+
+@pytest.fixture(scope='module')
+def rows():
+    """Collect rows, and write them."""
+    found = []
+    yield found
+    if found:
+        write('startup', 'make bench', f'Wall clock from the start of the process; shortest of {ROUNDS} '
+              f'repetitions. Loaded of {", ".join(SLOW)}, as `python -X importtime` says.',
+              table(['command', 'seconds', 'loads'], found))
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_startup(benchmark, name, rows, tmp_path, monkeypatch):
+    words = COMMANDS[name]
+    if name.endswith('ready') and find_spec('rclpy') is None:
+        pytest.skip('rclpy is not installed')
+    monkeypatch.chdir(tmp_path)
+    times = []
+
+    def take():
+        begun = time.perf_counter()
+        times.append(finish(words)[-1] - begun)
+
+    benchmark.pedantic(take, rounds=ROUNDS, warmup_rounds=1)
+    *lines, _ = finish(words, '-X', 'importtime')
+    loaded = {line.rpartition('|')[2].strip() for line in lines}
+    rows.append([name, f'{min(times[1:]):.2f}', ', '.join(one for one in SLOW if one in loaded) or 'none'])
