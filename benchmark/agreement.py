@@ -138,7 +138,7 @@ def main() -> None:
     text = [table(columns, rows),
             'The worst, and how far each engine is from itself where the friction changes by '
             f'{min(SHARES, key=abs):g} to {max(SHARES):g} of its value (the largest of {len(SHARES)} '
-            'rollouts): a stiff DLO that is dropped on a table magnifies rounding.',
+            'rollouts): some rollouts magnify the smallest change.',
             table(['number', 'object, action, self-contact', *RANDOM, 'radius', 'difference, mm',
                    'bullet to itself, mm', 'compiled to itself, mm'], spreads)]
     write('agreement', f'python benchmark/agreement.py --trials {arguments.trials} --seed {arguments.seed}',
