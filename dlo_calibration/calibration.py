@@ -27,7 +27,7 @@ import weakref
 
 import numpy as np
 
-from dlo_calibration.advice import Advice
+from dlo_calibration.advice import Advice, advise
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
@@ -414,6 +414,22 @@ def confirmed(result: CalibrationResult, simulator: Simulator,
             words = f'engine {name} disagrees with engine {result.engine}: {"; ".join(found)}'
     return replace(result, confirmation=confirmation, seconds=result.seconds + clock() - begun,
                    warnings=(*result.warnings, words) if words else result.warnings)
+
+
+def advised(result: CalibrationResult, simulator: Simulator,
+            should_stop: Callable[[], bool] = lambda: False,
+            clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
+    """
+    Return a result with the action that would tell most, if its uncertainty is known.
+
+    Actions are simulated for that, which counts in `seconds` and not in `simulations`.
+    """
+    if result.examination is None or not result.examination.regular:
+        return result
+    begun = clock()
+    advice = advise(result.trials, result.space, simulator, result.best.point,
+                    result.examination.uncertainty, result.length, should_stop)
+    return replace(result, advice=advice, seconds=result.seconds + clock() - begun)
 
 
 def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty) -> dict[str, ParameterEstimate]:

@@ -298,6 +298,8 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
 
 def document(result: CalibrationResult) -> dict[str, Any]:
     """Return what `fit` and `validate` print as JSON."""
+    from dlo_calibration import findings
+
     errors = result.errors
     return {
         'parameters': {
@@ -309,7 +311,7 @@ def document(result: CalibrationResult) -> dict[str, Any]:
         'trials': len(result.trials), 'evaluations': len(result.evaluations),
         'simulations': result.simulations, 'seconds': result.seconds, 'engine': result.engine,
         'search': result.search, 'seed': result.seed, 'stop_reason': result.stop_reason,
-        'warnings': list(result.warnings),
+        'warnings': list(result.warnings), **findings.values(result),
         'confirmation': None if result.confirmation is None else _confirmation(result.confirmation)}
 
 

@@ -32,7 +32,7 @@ import sys
 import time
 from typing import Any, Callable, Iterator, Sequence
 
-from dlo_calibration import terminal
+from dlo_calibration import findings, terminal
 from dlo_calibration.cli import document, validated
 from dlo_calibration.config import Options
 from dlo_calibration.description import read_result
@@ -110,7 +110,7 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
         *terminal.error_facts(result)[:4], ('evaluations', f'{file.evaluations} in {file.seconds:.1f} s'),
         ('search', f'{file.search}, seed {file.seed}'), ('engine', file.engine),
         ('ended', file.stop_reason)]))
-    for sentence in terminal.unidentifiable_words(result):
+    for sentence in findings.sentences(result):
         out.print(sentence)
     out.print(f'session and result.xml: {folder}', soft_wrap=True)
     out.print(f'simulated chains on the measured ones: {output / PICTURE}', soft_wrap=True)

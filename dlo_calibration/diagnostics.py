@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from typing import Any, Mapping, Sequence
 
+from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.messages import MessageTypes
@@ -67,12 +68,12 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
         message = (f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), '
                    f'{measured(p.physical_value, p.physical_unit)}')
         if not p.identifiable:
-            message += '; the trials could not tell it'
+            message += f'; {p.verdict or "the trials could not tell it"}'
         statuses.append(_status(types, OK if p.identifiable else WARN, name, message, {
             'value': p.value, 'std': p.std, 'lower': p.lower, 'upper': p.upper, 'unit': VALUE_UNIT,
             'physical_value': p.physical_value, 'physical_lower': p.physical_lower,
             'physical_upper': p.physical_upper, 'physical_unit': p.physical_unit,
-            'identifiable': p.identifiable}))
+            'identifiable': p.identifiable, 'verdict': p.verdict, 'note': p.note}))
     errors = found.errors
     statuses.append(_status(
         types, WARN if found.warnings else OK, WHOLE,
@@ -85,8 +86,17 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
             'simulations': found.simulations, 'seconds': found.seconds, 'engine': found.engine,
             'search': found.search, 'seed': '' if found.seed is None else found.seed,
             'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings),
-            **_confirmation(found.confirmation)}))
+            **_examination(found), **_confirmation(found.confirmation)}))
     return _diagnostics(types, stamp, statuses)
+
+
+def _examination(found: CalibrationResult) -> dict[str, Any]:
+    """Return what was found around the parameters; empty values where it was not examined."""
+    examined = findings.values(found)
+    lengths = {f'{key.removesuffix("_m")}_mm': '' if examined[key] is None else 1e3 * examined[key]
+               for key in ('cross_validated_error_m', 'default_error_m', 'noise_m', 'residual_std_m')}
+    return {**lengths, 'undetermined': '; '.join(found.undetermined),
+            'findings': '; '.join(findings.sentences(found))}
 
 
 def _confirmation(found: Confirmation | None) -> dict[str, Any]:
@@ -112,7 +122,8 @@ def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
             values = {pair.key: pair.value for pair in one.values}
             found[one.name] = {
                 key: value == 'true' if key == 'identifiable' else
-                value if key.endswith('unit') else float(value) for key, value in values.items()}
+                value if key.endswith(('unit', 'verdict', 'note')) else float(value)
+                for key, value in values.items()}
     return found
 
 

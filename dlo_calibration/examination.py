@@ -140,7 +140,7 @@ def _column(residuals: Floats, value: float, values: Floats, seen: Sequence[Floa
 
 
 def _arrived(residuals: Floats, jacobian: Floats, found: Uncertainty) -> bool:
-    """Tell whether the next Gauss-Newton step would stay among the values that the trials cannot tell apart."""
+    """Tell whether the next Gauss-Newton step stays among values that the trials cannot tell apart."""
     free = np.flatnonzero(found.excited & ~found.at_bound)
     columns = jacobian[:, free]
     capped = np.clip(residuals, -OUTLIER * found.residual, OUTLIER * found.residual)

@@ -25,10 +25,11 @@ from typing import Iterable, Sequence
 
 import numpy as np
 
+from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.errors import InputError
 from dlo_calibration.picture import trial_png
-from dlo_calibration.terminal import error_facts, number, unidentifiable_words
+from dlo_calibration.terminal import error_facts, number
 
 STYLE = """
 body { font-family: sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -51,14 +52,14 @@ def write_report(path: Path, result: CalibrationResult, command: str, problems: 
         f'<h3>{escape(trial.name)}, score {score:.1f}</h3><img alt="{escape(trial.name)}" '
         f'src="data:image/png;base64,{base64.b64encode(trial_png(trial, chains)).decode()}">'
         for trial, chains, score in zip(result.trials, result.chains, result.best.scores, strict=True))
-    words = [*unidentifiable_words(result), *(f'warning: {text}' for text in result.warnings), *problems]
+    words = [*findings.sentences(result), *(f'warning: {text}' for text in result.warnings), *problems]
     page = (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>calibration</title>'
         f'<style>{STYLE}</style></head><body><h1>Calibration</h1>'
-        + _table(('parameter', '0..100', 'interval', 'physical', 'interval', 'unit', ''), (
+        + _table(('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'unit', 'verdict'), (
             (name, f'{p.value:.1f}', f'{p.lower:.1f} to {p.upper:.1f}', number(p.physical_value),
              f'{number(p.physical_lower)} to {number(p.physical_upper)}', p.physical_unit,
-             '' if p.identifiable else 'not identifiable') for name, p in result.parameters.items()))
+             p.verdict) for name, p in result.parameters.items()))
         + ''.join(f'<p>{escape(text)}</p>' for text in words)
         + '<h2>Fit</h2>' + _table((), error_facts(result)) + '<h2>Trials</h2>' + pictures
         + f'<h2>To repeat it</h2><p><code>{escape(command)}</code></p></body></html>\n')

@@ -24,6 +24,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.score import SIMILAR, VERY_SIMILAR
 
@@ -78,14 +79,14 @@ def number(value: float | None, digits: int = 4) -> str:
 def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table of parameters in both units; rows as in the JSON document."""
     table = Table(title='parameters')
-    for title in ('parameter', '0..100', 'interval', 'physical', 'interval', 'unit', ''):
-        table.add_column(title, justify='left' if title in ('parameter', 'unit', '') else 'right')
+    for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'unit', 'verdict'):
+        table.add_column(title, justify='left' if title in ('parameter', 'unit', 'verdict') else 'right')
     for name, row in parameters.items():
         table.add_row(
             escape(name), f"{row['value']:.1f}", f"{row['lower']:.1f} .. {row['upper']:.1f}",
             number(row['physical_value']),
             f"{number(row['physical_lower'], 2)} .. {number(row['physical_upper'], 2)}",
-            escape(row['physical_unit']), '' if row['identifiable'] else 'not identifiable')
+            escape(row['physical_unit']), row['verdict'])
     return table
 
 
@@ -139,22 +140,13 @@ def _confirmation_facts(result: CalibrationResult) -> list[tuple[str, str]]:
              f'{other.max_distance * 1e3:.2f} mm at most')]
 
 
-def unidentifiable_words(result: CalibrationResult) -> list[str]:
-    """Return a sentence for what the trials could not tell, if anything."""
-    names = [name for name, estimate in result.parameters.items() if not estimate.identifiable]
-    if not names:
-        return []
-    return [f'not identifiable from these trials: {", ".join(names)}. Good evaluations lie far apart, so the '
-            'value is one of many; try more evaluations, or actions that depend on it.']
-
-
 def print_result(result: CalibrationResult, parameters: Mapping[str, Mapping[str, Any]],
                  stream: TextIO) -> None:
     """Print tables of the parameters and of the errors, and what the trials could not tell."""
     out = console(stream)
     out.print(parameter_table(parameters))
     out.print(facts_table('fit', error_facts(result)))
-    for sentence in unidentifiable_words(result):
+    for sentence in findings.sentences(result):
         out.print(escape(sentence))
 
 

@@ -27,11 +27,12 @@ import traceback
 from typing import Callable, Iterator, Sequence, Union
 
 from dlo_calibration import pool
-from dlo_calibration.calibration import calibrate, CalibrationResult, confirmed, Evaluation
+from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed, Evaluation
 from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.search import SEARCHES
+from dlo_calibration.excitation import priors
+from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
 
@@ -89,7 +90,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         on_notice(text)
 
     space = options.space
-    search = SEARCHES[options.search](space.dimension, options.seed)
+    search = SEARCHES[options.search](space.dimension, options.seed, hints(trials, options))
     with ExitStack() as stack:
         executor = _executor(options, notice, on_notice)  # its processes start while the engine is made
         if executor is not None:
@@ -100,9 +101,17 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         result = calibrate(
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
+        result = advised(result, simulator, should_stop)
     told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     result = replace(result, warnings=(*result.warnings, *told))
     return confirmed_with(result, options, make_simulator, should_stop)
+
+
+def hints(trials: Sequence[Trial], options: Options) -> Hints:
+    """Return what the observed chains alone say, for the search."""
+    known = priors(trials, options.space, options.table_height if options.table else None)
+    rows = tuple(int(count) for count in known.rows)
+    return Hints(known.start, known.lower, known.upper, rows, known.excites)
 
 
 def confirmed_with(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,

@@ -31,7 +31,7 @@ ORDER = (
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
     'search', 'confirmation', 'uncertainty', 'examination', 'advice', 'calibration', '__init__', 'config',
-    'parameter_file',
+    'parameter_file', 'findings',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',
