@@ -32,7 +32,7 @@ import numpy as np
 
 from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.contact import SelfContact
-from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
+from dlo_calibration.layout import feature_shares, Layout, rest_on, resting_level, spread_places
 from dlo_calibration.parameters import GRAVITY
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
@@ -84,13 +84,14 @@ class BulletRope:
     :param physical: physical values by parameter name, in SI units.
     :param radius: [m] at which it touches other bodies; None: its self-collision radius.
     :param velocities: (N, 3) [m/s] at the start; None: at rest.
+    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
     :param group: collision group of its own, one bit; two ropes that should
         touch each other need two.
     """
 
     def __init__(self, client: int, places: Floats, points: Floats, physical: Mapping[str, float], *,
                  radius: float | None = None, velocities: Floats | None = None,
-                 group: int = ROPE_GROUP) -> None:
+                 features: Floats | None = None, group: int = ROPE_GROUP) -> None:
         self._client = client
         world = pybullet.getPhysicsEngineParameters(physicsClientId=client)
         self.time_step: float = world['fixedTimeStep']
@@ -106,24 +107,27 @@ class BulletRope:
             for point in np.asarray(points, dtype=float))
         for body in self.bodies:
             pybullet.setCollisionFilterGroupMask(body, -1, group, ~group, physicsClientId=client)
-        self.reset(places, points, physical, velocities)
+        self.reset(places, points, physical, velocities, features)
 
     @classmethod
     def of(cls, client: int, chain: Chain, physical: Mapping[str, float], *, nodes: int = DEFAULT_NODES,
            **rest: Any) -> BulletRope:
-        """Put a rope where an observed chain is."""
+        """Put a rope where an observed chain is, with a marker where it is annotated as feature."""
         places = spread_places(np.array([0.0, chain.length]), nodes)
+        rest.setdefault('features', feature_shares(chain, places))
         return cls(client, places, chain.resample(places), physical, **rest)
 
     def reset(self, places: Floats, points: Floats, physical: Mapping[str, float],
-              velocities: Floats | None = None) -> None:
+              velocities: Floats | None = None, features: Floats | None = None) -> None:
         """Start anew, with other properties, without building anything in the world."""
         assert len(places) == len(points) == len(self.bodies)
         self._points = np.array(points, dtype=float)
         self._velocities = np.zeros_like(self._points) if velocities is None else np.array(velocities)
         self._support = np.zeros_like(self._points)
-        self._rod = Rod(np.diff(places), RodProperties.of(physical), self.time_step)
-        self._contact = SelfContact(places, physical['self_collision'], physical['friction'], self.time_step)
+        properties = RodProperties.of(physical)
+        self._rod = Rod(np.diff(places), properties, self.time_step, features)
+        self._contact = SelfContact(places * properties.length_scale, physical['self_collision'],
+                                    physical['friction'], self.time_step)
         self._contact.start(self._points)
         for body, mass, point in zip(self.bodies, self._rod.masses, self._points.tolist(), strict=True):
             pybullet.changeDynamics(
@@ -305,7 +309,7 @@ class BulletSimulator:
             self.close()
         if self._world is None:
             self._world = _World(layout, physical, self._time_step, radius, self._obstacles)
-        rope = self._world.start(layout.places, points, layout.velocities, physical, touching)
+        rope = self._world.start(layout, points, physical, touching)
         return roll_out(trial, layout, rope, self._settling)
 
     def refined(self) -> BulletSimulator:
@@ -354,17 +358,17 @@ class _World:
         self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=radius)
         self._among_obstacles = bool(obstacles)
 
-    def start(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+    def start(self, layout: Layout, points: Floats, physical: Mapping[str, float],
               touching: float | None) -> BulletRope:
         """Place rope and table; `touching` [m] is the height of the rope's middle on the table."""
         height = self.AWAY if touching is None else touching - self.radius
         # Bullet keeps contact points from step to step; a step without any forgets the last trial's.
         self._place_table(self.AWAY)
         if self._among_obstacles:
-            self._rope.reset(places, points + (0, 0, -self.AWAY), physical)
+            self._rope.reset(layout.places, points + (0, 0, -self.AWAY), physical)
         pybullet.stepSimulation(physicsClientId=self._client)
         self._place_table(height)
-        self._rope.reset(places, points, physical, velocities)
+        self._rope.reset(layout.places, points, physical, layout.velocities, layout.features)
         return self._rope
 
     def _place_table(self, height: float) -> None:

@@ -59,7 +59,7 @@ class CompiledRope:
         self._change = np.empty((nodes, 3))
 
     def reset(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
-              level: float | None) -> None:
+              level: float | None, features: Floats | None = None) -> None:
         """
         Start anew.
 
@@ -68,16 +68,18 @@ class CompiledRope:
         :param velocities: (N, 3) [m/s] at the start.
         :param physical: physical values by parameter name, in SI units.
         :param level: height [m] of nodes that touch the table; None: no table.
+        :param features: see `Layout`.
         """
         self._points = np.array(points, dtype=float)
         self._velocities = np.array(velocities, dtype=float)
         self._support = np.zeros_like(self._points)
-        self._rod = Rod(np.diff(places), RodProperties.of(physical), self.time_step)
+        properties = RodProperties.of(physical)
+        self._rod = Rod(np.diff(places), properties, self.time_step, features)
         diameter = 2 * physical['self_collision']
         half = self._rod.rest_lengths / 2
         apart = max(np.pi * physical['self_collision'], float(half.max()))
-        kernels.start_distances(self._points, places[:-1] + half, half, apart, diameter, self._pairs,
-                                self._distances)
+        middles = places[:-1] * properties.length_scale + half
+        kernels.start_distances(self._points, middles, half, apart, diameter, self._pairs, self._distances)
         self._constants = np.array([
             self._rod.drag, self._rod.implicit, self.time_step, GRAVITY,
             NOWHERE if level is None else level, physical['friction'], diameter, apart, -1.0, 0.0])
@@ -111,9 +113,9 @@ class CompiledRope:
         rod = self._rod
         taken = kernels.advance(
             np.ascontiguousarray(targets), self._held, self._points, self._velocities, self._support,
-            rod.rest_lengths, rod.stiffness, rod.masses, self._inverse_masses, rod.bending, self._distances,
-            self._pairs, self._contacts, self._bands, self._right, self._wanted, self._change,
-            self._constants)
+            rod.rest_lengths, rod.stiffness, rod.masses, self._inverse_masses, rod.bending, rod.natural,
+            self._distances, self._pairs, self._contacts, self._bands, self._right, self._wanted,
+            self._change, self._constants)
         if taken < len(targets):
             raise SimulationError('the rollout diverged: the chain is no longer finite')
 
@@ -161,7 +163,8 @@ class CompiledSimulator:
             points = rest_on(points, level)
         if self._rope is None:
             self._rope = CompiledRope(self._nodes, self._time_step)
-        self._rope.reset(layout.places, points, layout.velocities, physical, level)
+        self._rope.reset(layout.places, points, layout.velocities, physical, level,
+                         layout.features)
         return roll_out(trial, layout, self._rope, self._settling)
 
     def _layout(self, trial: Trial) -> tuple[Layout, float | None]:

@@ -26,7 +26,15 @@ from typing import Any, Iterator, Mapping
 
 from dlo_calibration.calibration import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import BY_NAME, measured, PAPER_PARAMETERS, PARAMETERS, ParameterSpace, SCALE
+from dlo_calibration.parameters import (
+    BY_NAME,
+    measured,
+    MOST_PARTS,
+    PAPER_PARAMETERS,
+    PARAMETERS,
+    ParameterSpace,
+    SCALE,
+)
 from dlo_calibration.search import SEARCHES
 
 AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
@@ -106,6 +114,10 @@ class Options:
     calibrate: tuple[str, ...] = _option(
         PAPER_PARAMETERS, 'names of the parameters to find; the others keep their value',
         choices=tuple(BY_NAME))
+    parts: int = _option(
+        1, 'equal parts of the length that have a bending stiffness of their own; more than 1: where '
+        'flexibility is calibrated, so are stiffness_2 and so on; as many at least as calibrate names',
+        minimum=1, maximum=MOST_PARTS)
     search: str = _option('least_squares', 'search method', choices=tuple(SEARCHES))
     evaluations: int = _option(PAPER_EVALUATIONS, "parameter sets to try at most (the paper's rounds)",
                                minimum=1, maximum=1000000)
@@ -172,7 +184,8 @@ class Options:
     @property
     def space(self) -> ParameterSpace:
         """The parameters to find, and where the others stay."""
-        return ParameterSpace(self.calibrate, self.values, self.mass)
+        parts = max(self.parts, ParameterSpace(self.calibrate).parts)
+        return ParameterSpace(self.calibrate, self.values, self.mass).divided(parts)
 
 
 def _unknown(name: str) -> Any:
@@ -183,7 +196,8 @@ def _unknown(name: str) -> Any:
 FIXED_VALUES: Mapping[str, Declaration] = {
     p.name: Declaration(
         p.name, p.default, f'{p.description}: {p.quantity}, where it is not calibrated '
-        f'(0: {measured(p.at_zero, p.unit)}, 100: {measured(p.at_hundred, p.unit)}, logarithmic)',
+        f'(0: {measured(p.at_zero, p.unit)}, 100: {measured(p.at_hundred, p.unit)}, '
+        f'{"linear" if p.linear else "logarithmic"})',
         minimum=0.0, maximum=SCALE)
     for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg of its own
 

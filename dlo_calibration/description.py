@@ -32,7 +32,7 @@ from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
 from dlo_calibration.chain import Chain
 from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import PARAMETERS, ParameterSpace, SCALE
+from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors
 from dlo_calibration.xml import (
     add,
@@ -102,7 +102,7 @@ class Description:
     def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> Description:
         """Return the definition of the DLO that a calibration found."""
         space = result.space
-        fixed = {p.name: space.fixed.get(p.name, p.default) for p in PARAMETERS
+        fixed = {p.name: space.fixed.get(p.name, p.default) for p in space.parameters
                  if p.name not in result.parameters and (p.name != 'mass' or 'mass' in space.fixed)}
         return cls(
             parameters=result.parameters, mass=space.mass, fixed=fixed,

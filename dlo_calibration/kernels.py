@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Kernels: the steps of `rod`, `contact` and a table with friction, compiled by Numba.
+Kernels: the steps of `rod`, `natural`, `contact` and a table with friction, compiled by Numba.
 
-They compute what `rod.Rod.velocities` and `contact.SelfContact.velocities` do, and
+They compute what `rod.Rod.velocities`, `natural.natural_forces` and `contact.SelfContact.velocities` do, and
 what Bullet does with spheres on a plane, for many steps in one call.  The machine
 code is kept in Numba's cache, so that it is compiled once a machine.
 """
@@ -38,6 +38,7 @@ from dlo_calibration.contact import (
     UNSUPPORTED,
     WEDGED,
 )
+from dlo_calibration.natural import HAIRPIN, ROUNDED
 from dlo_calibration.rod import HELD
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
@@ -92,16 +93,98 @@ def _solve(bands: Floats, right: Floats) -> bool:
     return math.isfinite(total)
 
 
+@_compiled(f'void({MATRIX}, {VECTOR}, f8, {VECTOR})')
+def add_natural(points: Floats, moments: Floats, step: float, right: Floats) -> None:
+    """Add to `right` (3 N,) the impulses [N s] of the natural curvature; see `natural.natural_forces`."""
+    n = len(points) - 1
+    # columns: tangent, frame, torque; then length, and of the joint at its end half, both bends
+    tangent, frame, torque, length, half, bend = 0, 3, 6, 9, 10, 11
+    segments = np.zeros((n, 13))
+    for i in range(n):
+        segment = segments[i]
+        for c in range(3):
+            segment[tangent + c] = points[i + 1, c] - points[i, c]
+        segment[length] = math.sqrt(segment[0]**2 + segment[1]**2 + segment[2]**2)
+        for c in range(3):
+            segment[tangent + c] /= segment[length]
+    start = segments[0]
+    least = 0
+    for c in range(1, 3):
+        if abs(start[c]) < abs(start[least]):
+            least = c
+    one, two = (least + 1) % 3, (least + 2) % 3
+    size = math.hypot(start[one], start[two])
+    start[frame + one], start[frame + two] = start[two] / size, -start[one] / size
+    total_x, total_y, total_moment = 0.0, 0.0, 0.0
+    for i in range(n - 1):
+        a, b = segments[i], segments[i + 1]
+        cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        a[half] = math.sqrt(max((1.0 + cosine) / 2, HAIRPIN))
+        x = b[0] * a[3] + b[1] * a[4] + b[2] * a[5]
+        y = (b[0] * (a[1] * a[5] - a[2] * a[4]) + b[1] * (a[2] * a[3] - a[0] * a[5])
+             + b[2] * (a[0] * a[4] - a[1] * a[3]))
+        share = x / (2 * a[half]**2)
+        for c in range(3):
+            b[frame + c] = a[frame + c] - share * (a[c] + b[c])
+        left = b[0] * b[3] + b[1] * b[4] + b[2] * b[5]  # nothing but in a hairpin
+        for c in range(3):
+            b[frame + c] -= left * b[c]
+        size = math.sqrt(b[3]**2 + b[4]**2 + b[5]**2)
+        for c in range(3):
+            b[frame + c] /= size
+        a[bend], a[bend + 1] = x / a[half], y / a[half]
+        total_x += moments[i] * a[bend]
+        total_y += moments[i] * a[bend + 1]
+        total_moment += moments[i]
+    size = math.sqrt(total_x**2 + total_y**2 + (ROUNDED * total_moment / (n - 1))**2)
+    total_x /= size
+    total_y /= size
+    for i in range(n):
+        a = segments[i]
+        x = total_x * a[3] + total_y * (a[1] * a[5] - a[2] * a[4])
+        y = total_x * a[4] + total_y * (a[2] * a[3] - a[0] * a[5])
+        z = total_x * a[5] + total_y * (a[0] * a[4] - a[1] * a[3])
+        a[3], a[4], a[5] = x, y, z
+    against_twist = 0.0
+    for i in range(n - 1):
+        a, b = segments[i], segments[i + 1]
+        both = (total_x * a[bend] + total_y * a[bend + 1]) / (4 * a[half]**2)
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            joint = moments[i] * (
+                (b[d] * a[frame + e] - b[e] * a[frame + d] + a[d] * b[frame + e] - a[e] * b[frame + d])
+                / (2 * a[half]) + both * (a[d] * b[e] - a[e] * b[d]))
+            b[torque + c] += joint
+            a[torque + c] -= joint
+        against_twist -= a[0] * a[6] + a[1] * a[7] + a[2] * a[8]
+        a[length + 3] = against_twist
+    for i in range(n - 1):
+        a, b = segments[i], segments[i + 1]
+        share = a[length + 3] / (2 * a[half]**2)
+        for c in range(3):
+            axis = share * (a[c] + b[c])
+            b[torque + c] -= axis
+            a[torque + c] += axis
+    for i in range(n):
+        a = segments[i]
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            impulse = step * (a[torque + d] * a[e] - a[torque + e] * a[d]) / a[length]
+            right[3 * i + 3 + c] += impulse
+            right[3 * i + c] -= impulse
+
+
 @_compiled(f'boolean({MATRIX}, {MATRIX}, {MATRIX}, {INDICES}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, f8, f8, f8, {MATRIX}, {VECTOR})')
+           f' {MATRIX}, {VECTOR}, f8, f8, f8, {MATRIX}, {VECTOR})')
 def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any, follow: Floats,
-                   rest: Floats, stiffness: Floats, masses: Floats, bending: Floats, drag: float,
-                   implicit: float, step: float, bands: Floats, right: Floats) -> bool:
+                   rest: Floats, stiffness: Floats, masses: Floats, bending: Floats, natural: Floats,
+                   drag: float, implicit: float, step: float, bands: Floats, right: Floats) -> bool:
     """
     Put the velocities after one step into `wanted`; see `rod.Rod.velocities`.
 
     Gravity is added by the caller, in `velocities`.
 
+    :param natural: (N - 2,) [N m] as `rod.Rod.natural`; (0,): straight at rest.
     :param bands: (3 N + 6, 7), workspace.
     :param right: (3 N + 6,), workspace.
     :returns: False where the rollout diverges.
@@ -165,6 +248,8 @@ def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any
         bands[j + 2, 1] -= xz
         bands[j + 2, 2] -= yz
         bands[j + 2, 3] -= zz
+    if len(natural) > 0:
+        add_natural(points, natural, step, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
         for c in range(3):
@@ -385,11 +470,12 @@ def rest_on_table(points: Floats, velocities: Floats, level: float, friction: fl
 
 
 @_compiled(f'i8(f8[:,:,::1], {INDICES}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}, {VECTOR})')
+           f' {MATRIX}, {VECTOR}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX},'
+           f' {VECTOR})')
 def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, support: Floats, rest: Floats,
-            stiffness: Floats, masses: Floats, inverse_masses: Floats, bending: Floats, distances: Floats,
-            pairs: Any, contacts: Floats, bands: Floats, right: Floats, wanted: Floats, change: Floats,
-            constants: Floats) -> int:
+            stiffness: Floats, masses: Floats, inverse_masses: Floats, bending: Floats, natural: Floats,
+            distances: Floats, pairs: Any, contacts: Floats, bands: Floats, right: Floats, wanted: Floats,
+            change: Floats, constants: Floats) -> int:
     """
     Take k steps; everything but `targets` (k, h, 3) [m] is the state, see `compiled.CompiledRope`.
 
@@ -409,7 +495,7 @@ def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, supp
         for i in range(n):
             velocities[i, 2] -= step * gravity
         if not rod_velocities(points, velocities, wanted, held, follow, rest, stiffness, masses, bending,
-                              drag, implicit, step, bands, right):
+                              natural, drag, implicit, step, bands, right):
             return k
         fastest = 0.0
         for i in range(n):

@@ -42,6 +42,7 @@ class Layout:
     :param velocities: (N, 3) [m/s] at the start.
     :param observe: (n, N) weights; with the nodes' positions they give the observed points.
     :param point_places: (n,) [m] of the observed points along the DLO.
+    :param features: (N,) share of each node in the points annotated as feature.
     """
 
     places: Floats
@@ -49,6 +50,7 @@ class Layout:
     velocities: Floats
     observe: Floats
     point_places: Floats
+    features: Floats
 
     def nodes(self, hand: Hand) -> tuple[int, ...]:
         """Return the nodes that a hand grips."""
@@ -76,7 +78,25 @@ class Layout:
         velocities = np.zeros((count, 3)) if trial.velocity is None else \
             interpolation_matrix(point_places, places) @ trial.velocity
         return cls(frozen_array(places), frozen_array(initial.resample(places)), frozen_array(velocities),
-                   frozen_array(observe), frozen_array(point_places))
+                   frozen_array(observe), frozen_array(point_places),
+                   frozen_array(feature_shares(initial, places)))
+
+
+def feature_shares(chain: Chain, places: Floats) -> Floats:
+    """
+    Return how many of the points annotated as feature belong to each node, (N,).
+
+    What is between two nodes goes to both, so that its centre of mass stays in place.
+
+    :param places: (N,) [m] of the nodes along the chain.
+    """
+    at = chain.arc_lengths()[chain.features]
+    after = np.clip(np.searchsorted(places, at), 1, len(places) - 1)
+    share = np.clip((at - places[after - 1]) / (places[after] - places[after - 1]), 0.0, 1.0)
+    shares = np.zeros(len(places))
+    np.add.at(shares, after - 1, 1 - share)
+    np.add.at(shares, after, share)
+    return shares
 
 
 def _without_noise(trial: Trial) -> Chain:

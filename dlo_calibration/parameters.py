@@ -40,11 +40,14 @@ ASSUMED_DENSITY = 0.05  # kg/m, of a DLO whose mass is not known
 @dataclass(frozen=True)
 class Parameter:
     """
-    One parameter of a DLO, on a logarithmic scale from 0 to 100.
+    One parameter of a DLO, on a scale from 0 to 100.
 
     :param at_zero: physical value at 0.
     :param at_hundred: physical value at 100.
     :param default: value on the 0..100 scale where it is not calibrated.
+    :param linear: True where the scale is linear, else it is logarithmic.
+    :param neutral: physical value at exactly the default, whatever the scale rounds it to,
+        where the default means that the DLO is without what the parameter describes.
     :param per_weight: True where only its ratio to the DLO's weight shows in
         motion that gravity drives, so that without a known mass the ratio is reported.
     """
@@ -57,14 +60,32 @@ class Parameter:
     default: float
     description: str
     per_weight: bool = False
+    linear: bool = False
+    neutral: float | None = None
 
     def physical(self, value: float) -> float:
         """Physical value of `value` on the 0..100 scale."""
+        if self.neutral is not None and value == self.default:
+            return self.neutral
+        if self.linear:
+            return self.at_zero + (self.at_hundred - self.at_zero) * value / SCALE
         return self.at_zero * math.pow(self.at_hundred / self.at_zero, value / SCALE)
 
     def value(self, physical: float) -> float:
-        """Value on the 0..100 scale (beyond it too) of a physical value > 0."""
+        """Value on the 0..100 scale (beyond it too) of a physical value; > 0 on a logarithmic one."""
+        if physical == self.neutral:
+            return self.default
+        if self.linear:
+            return SCALE * (physical - self.at_zero) / (self.at_hundred - self.at_zero)
         return SCALE * math.log(physical / self.at_zero) / math.log(self.at_hundred / self.at_zero)
+
+
+MOST_PARTS = 6  # of a DLO, that have a bending stiffness of their own
+
+
+def part_name(part: int) -> str:
+    """Name the parameter of a part of the DLO, counted from 1; the first has `flexibility`."""
+    return 'flexibility' if part == 1 else f'stiffness_{part}'
 
 
 #: The paper's four, then what is fixed by default.
@@ -82,8 +103,19 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-5, 1e-1, 25.0,
               'how fast bending and stretching vibrations die out (0.6 time steps at least)'),
     Parameter('mass', 'mass of the whole DLO', 'kg', 1e-3, 1e1, 42.0, 'mass of the whole DLO'),
+    Parameter('length_scale', 'length at rest by the observed length', '1', 0.9, 1 / 0.9, 50.0,
+              'how long the DLO is, where the observed length is not exact', neutral=1.0),
+    Parameter('natural_curvature', 'curvature at rest', '1/m', 0.0, 10.0, 0.0,
+              'how curved the DLO is where nothing bends it', linear=True, neutral=0.0),
+    Parameter('marker_mass', 'mass at each point annotated as feature', 'kg', 1e-6, 1e-1, 0.0,
+              'how heavy a marker or plug is, beside the DLO (0: nothing)', per_weight=True,
+              neutral=0.0),
+    *(Parameter(part_name(part), f'bending stiffness of part {part} by that of part 1', '1', 0.02, 50.0, 50.0,
+                f'how stiff part {part} of the DLO is, of as many equal parts as there are', neutral=1.0)
+      for part in range(2, MOST_PARTS + 1)),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 
 
@@ -96,6 +128,9 @@ def measured(value: float, unit: str) -> str:
 class ParameterSpace:
     """
     Which parameters a calibration finds, and where the others stay.
+
+    The DLO has as many parts of equal length as the highest `stiffness_...` that is
+    free or fixed says; one, where there is none.
 
     :param free: names of the parameters to find, in order.
     :param fixed: values of others on the 0..100 scale; those not named keep
@@ -129,6 +164,34 @@ class ParameterSpace:
         return len(self.free)
 
     @property
+    def parts(self) -> int:
+        """Number of parts of the DLO that have a bending stiffness of their own."""
+        return max((part for part in range(1, MOST_PARTS + 1)
+                    if part == 1 or part_name(part) in (*self.free, *self.fixed)))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The entries of the table that this DLO has: all but those of parts that it has not."""
+        absent = PART_NAMES[self.parts - 1:]
+        return tuple(parameter for parameter in PARAMETERS if parameter.name not in absent)
+
+    def divided(self, parts: int) -> ParameterSpace:
+        """
+        Return the space of a DLO of that many parts of equal length.
+
+        Where `flexibility` is free, so is the stiffness of every other part.
+        """
+        absent = PART_NAMES[parts - 1:]
+        free = tuple(name for name in self.free if name not in absent)
+        fixed = {name: value for name, value in self.fixed.items() if name not in absent}
+        for name in PART_NAMES[:parts - 1]:
+            if 'flexibility' in free and name not in free:
+                free += (name,)
+            elif name not in free:
+                fixed.setdefault(name, BY_NAME[name].default)
+        return ParameterSpace(free, fixed, self.mass)
+
+    @property
     def mass_known(self) -> bool:
         """Tell whether physical values can be given in absolute units."""
         return self.mass > 0 or 'mass' in self.free or 'mass' in self.fixed
@@ -147,13 +210,13 @@ class ParameterSpace:
 
     def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:
         """
-        Return every parameter's physical value, by name.
+        Return the physical value of every parameter that the DLO has, by name.
 
         :param values: free parameters on the 0..100 scale.
         :param length: of the DLO [m], for the mass where that is not known.
         """
         physical = {p.name: p.physical(values.get(p.name, self.fixed.get(p.name, p.default)))
-                    for p in PARAMETERS}
+                    for p in self.parameters}
         if 'mass' not in values and 'mass' not in self.fixed:
             physical['mass'] = self.mass if self.mass > 0 else ASSUMED_DENSITY * length
         return physical

@@ -30,6 +30,9 @@ damping wherever that is large enough to be stable, and 0.6 dt^2 where it is
 not (at 0.5 the stiffest modes would ring for ever): the damping is then less the
 time step's.  The part of the stretching matrix that a compressed spring makes
 negative is left out, so that the matrix stays positive definite.
+
+A DLO with natural curvature: see `natural`.  Parts of different stiffness: an inner
+node has the stiffness of the pieces on its two sides in series.
 """
 
 from __future__ import annotations
@@ -44,6 +47,8 @@ from scipy.linalg import lapack
 
 from dlo_calibration.chain import Floats
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.natural import natural_forces
+from dlo_calibration.parameters import PART_NAMES
 
 Indices = NDArray[np.intp]
 
@@ -62,6 +67,10 @@ class RodProperties:
     :param mass: of the whole rod [kg].
     :param drag: acceleration against the velocity [1/s].
     :param internal_damping: damping per stiffness [s].
+    :param length_scale: rest lengths relative to the observed ones.
+    :param natural_curvature: at rest [1/m].
+    :param marker_mass: at each point annotated as feature [kg].
+    :param profile: bending stiffness of equal parts of the length, relative to the first one's.
     """
 
     bending_stiffness: float
@@ -69,26 +78,41 @@ class RodProperties:
     mass: float
     drag: float = 0.0
     internal_damping: float = 0.0
+    length_scale: float = 1.0
+    natural_curvature: float = 0.0
+    marker_mass: float = 0.0
+    profile: tuple[float, ...] = (1.0,)
 
     @classmethod
     def of(cls, physical: Mapping[str, float]) -> RodProperties:
-        """Take them from physical values by parameter name."""
+        """
+        Take them from physical values by parameter name.
+
+        Those that are not in it and can be absent are: an older result names fewer.
+        """
+        profile = (1.0, *(physical[name] for name in PART_NAMES if name in physical))
         return cls(bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
                    mass=physical['mass'], drag=physical['damping'],
-                   internal_damping=physical['internal_damping'])
+                   internal_damping=physical['internal_damping'],
+                   length_scale=physical.get('length_scale', 1.0),
+                   natural_curvature=physical.get('natural_curvature', 0.0),
+                   marker_mass=physical.get('marker_mass', 0.0), profile=profile)
 
 
 class Rod:
     """
-    A chain of N nodes, straight at rest, whose velocities are stepped by its internal forces and gravity.
+    A chain of N nodes whose velocities are stepped by its internal forces and gravity.
 
-    :param rest_lengths: (N - 1,) [m] of the segments; they need not be equal.
+    :param rest_lengths: (N - 1,) [m] of the segments as observed; they need not be equal.
     :param properties: see `RodProperties`.
     :param time_step: [s].
+    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
     """
 
-    def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float) -> None:
+    def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
+                 features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
+        rest_lengths = rest_lengths * properties.length_scale
         #: (N - 1,) [m]
         self.rest_lengths = rest_lengths
         self._step = time_step
@@ -99,9 +123,13 @@ class Rod:
         weights[1:] += rest_lengths / 2
         #: (N,) mass of each node [kg]
         self.masses = properties.mass * weights / weights.sum()
+        if features is not None:
+            self.masses += properties.marker_mass * features
         #: [1/s]
         self.drag = properties.drag
         self._bending_stiffness = properties.bending_stiffness
+        self._natural_curvature = properties.natural_curvature
+        self._profile = np.array(properties.profile)
         #: c of the step [s^2], see the module
         self.implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
         self.hold(())
@@ -119,7 +147,12 @@ class Rod:
         held[self._held] = True
         rigid = held[:-1] & held[1:]
         #: (3, N) bending matrix [N/m]: its diagonal and the two below it
-        self.bending = _bending_bands(self.rest_lengths, rigid, self._bending_stiffness)
+        stiffnesses = self._stiffnesses(rigid)
+        self.bending = _bending_bands(self.rest_lengths, rigid, stiffnesses)
+        #: (N - 2,) [N m] that would straighten each inner node; (0,) of a DLO that is straight at rest
+        self.natural: Floats = np.zeros(0)
+        if self._natural_curvature and not rigid.all():
+            self.natural = self._natural_curvature * np.where(rigid[:-1] & rigid[1:], 0.0, stiffnesses)
         self._constant: Floats | None = None
 
     @property
@@ -145,6 +178,8 @@ class Rod:
         slack = (1 - self.rest_lengths / lengths)[:, None]
         tensions = self.stiffness[:, None] * slack * segments
         forces = -self._bend(points)
+        if len(self.natural):
+            forces += natural_forces(segments, lengths, self.natural)
         forces[:-1] += tensions
         forces[1:] -= tensions
         right = self.masses[:, None] * (velocities + step * gravity) + step * forces
@@ -171,6 +206,28 @@ class Rod:
             raise SimulationError('the rollout diverged: the chain is no longer finite')
         return np.asarray(solution).reshape(-1, 3)
 
+    def _stiffnesses(self, rigid: NDArray[np.bool_]) -> Floats:
+        """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
+        stiffness: Floats = np.full(len(self.rest_lengths) - 1, self._bending_stiffness)
+        if (self._profile == 1).all():
+            return stiffness
+        ends = np.concatenate([[0.0], np.cumsum(self.rest_lengths)])
+        bounds = np.linspace(0, ends[-1], len(self._profile) + 1)
+        flexibility = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / self._profile)])  # up to each bound
+
+        def between(a: Floats, b: Floats) -> Floats:
+            here, there = (np.interp(place, bounds, flexibility) for place in (a, b))
+            share: Floats = there - here
+            return share
+
+        middles = (ends[:-1] + ends[1:]) / 2
+        bendable = np.where(rigid, 0.0, self.rest_lengths / 2)
+        total = np.where(rigid[:-1], 0.0, between(middles[:-1], ends[1:-1])) + np.where(
+            rigid[1:], 0.0, between(ends[1:-1], middles[1:]))
+        cells = bendable[:-1] + bendable[1:]
+        stiffness *= np.divide(cells, total, out=np.ones_like(total), where=total > 0)
+        return stiffness
+
     def _constant_bands(self) -> Floats:
         """Return the part of the matrix that stays the same until other nodes are held, (BANDS, N, 3)."""
         bands = np.zeros((BANDS, len(self.masses), 3))
@@ -193,7 +250,7 @@ class Rod:
 _ROWS, _COLUMNS = (np.array(indices) for indices in ((0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 1, 0)))
 
 
-def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: float) -> Floats:
+def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: Floats) -> Floats:
     """Bending matrix (N, N), symmetric: its diagonal and the two below it, (3, N)."""
     n = len(rest_lengths) + 1
     before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]

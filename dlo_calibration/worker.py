@@ -31,7 +31,6 @@ from dlo_calibration.calibration import advised, calibrate, CalibrationResult, c
 from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.excitation import priors
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
@@ -109,6 +108,8 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
 
 def hints(trials: Sequence[Trial], options: Options) -> Hints:
     """Return what the observed chains alone say, for the search."""
+    from dlo_calibration.excitation import priors  # which loads half of SciPy
+
     known = priors(trials, options.space, options.table_height if options.table else None)
     rows = tuple(int(count) for count in known.rows)
     return Hints(known.start, known.lower, known.upper, rows, known.excites)

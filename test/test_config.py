@@ -160,3 +160,18 @@ def test_the_space_follows_from_the_options():
 
 def test_every_search_can_be_chosen():
     assert DECLARED['search'].choices == tuple(SEARCHES)
+
+
+def test_parts_are_found_where_flexibility_is():
+    assert Options().space.parts == 1
+    space = Options.of({'calibrate': ['flexibility', 'friction'], 'parts': 3, 'stiffness_5': 70.0}).space
+    assert space.free == ('flexibility', 'friction', 'stiffness_2', 'stiffness_3')
+    assert space.parts == 3
+    fixed = Options.of({'calibrate': ['friction'], 'parts': 2, 'stiffness_2': 70.0}).space
+    assert (fixed.free, fixed.parts, fixed.fixed['stiffness_2']) == (('friction',), 2, 70.0)
+
+
+def test_there_are_as_many_parts_as_calibrate_names():
+    space = Options.of({'calibrate': ['flexibility', 'stiffness_3'], 'parts': 2}).space
+    assert space.free == ('flexibility', 'stiffness_3', 'stiffness_2')
+    assert Options.of({'calibrate': ['stiffness_3']}).space.parts == 3

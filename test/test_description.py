@@ -36,7 +36,7 @@ from dlo_calibration.description import (
     write_result,
 )
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import PARAMETERS, ParameterSpace
+from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.search.random import RandomSearch
 
 OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
@@ -215,7 +215,8 @@ def test_text_of_a_message_is_read_too(result):
 
 def test_fixed_values_are_complete_and_in_units(result):
     found = read_description(description_document(result))
-    assert set(found.fixed) | set(found.values) == {one.name for one in PARAMETERS} - {'mass'}
+    names = {one.name for one in ParameterSpace().parameters}
+    assert set(found.fixed) | set(found.values) == names - {'mass'}
     element = etree.fromstring(description_document(result)).find('.//fixed[@name="elasticity"]')
     assert element.get('physical_unit') == 'N'
     assert float(element.get('physical_value')) == pytest.approx(result.physical()['elasticity'])

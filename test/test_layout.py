@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
-from dlo_calibration.layout import Layout, rest_on, resting_level, spread_places
+from dlo_calibration.layout import feature_shares, Layout, rest_on, resting_level, spread_places
 
 
 def arc(count=21, height=0.0):
@@ -141,3 +141,12 @@ def test_points_that_rest_are_put_on_the_level_and_others_are_left():
     low = points[:, 2] < 0.010
     assert (rested[low, 2] == 0.008).all()
     assert points[0, 2] == pytest.approx(0.004)  # the given ones stay as they were
+
+
+def test_what_is_annotated_as_feature_belongs_to_the_nodes_beside_it():
+    points = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
+    marked = Chain(points, features=np.isin(np.arange(11), (0, 3, 10)))
+    shares = feature_shares(marked, np.linspace(0, 1, 5))
+    assert shares == pytest.approx([1, 0.8, 0.2, 0, 1])
+    assert shares @ np.linspace(0, 1, 5) == pytest.approx(0.3 + 1)  # the centre of mass is where it was
+    assert not feature_shares(Chain(points), np.linspace(0, 1, 5)).any()

@@ -83,11 +83,49 @@ def test_a_point_of_the_cube_and_the_values_of_its_parameters():
 def test_physical_values_are_the_found_ones_then_the_fixed_ones_then_the_defaults():
     space = ParameterSpace(('flexibility',), {'friction': 10.0})
     physical = space.physical({'flexibility': 60.0}, length=1.0)
-    assert set(physical) == set(BY_NAME)
+    assert set(physical) == {name for name in BY_NAME if not name.startswith('stiffness_')}
     assert physical['flexibility'] == pytest.approx(MAPPING['flexibility'](60), rel=1e-12)
     assert physical['friction'] == pytest.approx(MAPPING['friction'](10), rel=1e-12)
     assert physical['elasticity'] == pytest.approx(
         MAPPING['elasticity'](BY_NAME['elasticity'].default), rel=1e-12)
+
+
+def test_more_of_the_object_is_off_by_default_exactly():
+    physical = ParameterSpace().physical({}, length=1.0)
+    assert (physical['length_scale'], physical['natural_curvature'], physical['marker_mass']) == (1, 0, 0)
+    parts = ParameterSpace().divided(6).physical({}, length=1.0)
+    assert [parts[f'stiffness_{part}'] for part in range(2, 7)] == [1] * 5
+    assert BY_NAME['length_scale'].value(1.0) == 50
+    assert BY_NAME['marker_mass'].value(0.0) == 0
+
+
+def test_a_linear_scale_reaches_zero():
+    curvature = BY_NAME['natural_curvature']
+    assert [curvature.physical(u) for u in (0, 25, 100)] == [0, 2.5, 10]
+    assert curvature.value(5.0) == 50
+
+
+def test_as_many_parts_as_the_highest_one_named():
+    assert ParameterSpace().parts == 1
+    space = ParameterSpace(('flexibility', 'stiffness_3'))
+    assert space.parts == 3
+    assert [name for name in space.physical({}, 1.0) if name.startswith('stiffness_')] == [
+        'stiffness_2', 'stiffness_3']
+    assert ParameterSpace(('friction',), {'stiffness_2': 40.0}).parts == 2
+
+
+def test_a_divided_space_finds_the_stiffness_of_every_part():
+    space = ParameterSpace(('flexibility', 'friction'), {'damping': 40.0}, 0.3)
+    three = space.divided(3)
+    assert three == ParameterSpace(
+        ('flexibility', 'friction', 'stiffness_2', 'stiffness_3'), {'damping': 40.0}, 0.3)
+    assert three.divided(1) == space
+    assert three.divided(2).free == ('flexibility', 'friction', 'stiffness_2')
+    # Where flexibility is not to be found, neither is that of a part.
+    rest = ParameterSpace(('friction',), {'flexibility': 20.0, 'stiffness_2': 60.0}).divided(3)
+    assert rest.free == ('friction',)
+    assert rest.parts == 3
+    assert rest.fixed == {'flexibility': 20.0, 'stiffness_2': 60.0, 'stiffness_3': 50.0}
 
 
 @pytest.mark.parametrize(('arguments', 'text'), [

@@ -173,6 +173,56 @@ def test_a_hanging_rod_stretches_by_the_textbook_whatever_its_segments(name):
     assert stretch == pytest.approx(9.81 * 0.05 * rest.sum()**2 / (2 * 20.0), rel=0.002)
 
 
+@pytest.mark.parametrize('profile', [(1.0, 0.3, 4.0), (1.0, 5.0)])
+@pytest.mark.parametrize('count', [12, 40])
+def test_a_cantilever_of_parts_bends_like_its_parts_in_series(profile, count):
+    rest = np.concatenate([[0.01], np.full(count, 1 / count)])
+    stiffness, load = 0.8, 0.01 * 9.81 * 0.05
+    properties = RodProperties(stiffness, 1e5, 0.05 * rest.sum(), drag=5.0, internal_damping=0.2,
+                               profile=profile)
+    tip = rest_of(Rod(rest, properties, 0.2), straight(rest), (0, 1), 0.01 * GRAVITY)[-1]
+    # Small deflections: the tip sinks by the integral of M x / EI, with M = load x^2 / 2 at x from the tip.
+    ends = rest.sum() * np.linspace(0, 1, len(profile) + 1) - 0.01
+    away = 1 - np.clip(ends, 0, 1)
+    expected = sum(load * (a**4 - b**4) / (8 * stiffness * relative)
+                   for a, b, relative in zip(away[:-1], away[1:], profile, strict=True))
+    assert tip[2] == pytest.approx(-expected, rel=0.03 if count == 12 else 0.005)
+
+
+def test_equal_parts_are_one_rod_bit_for_bit():
+    rest, one = np.full(12, 0.03), RodProperties(1e-2, 500.0, 0.05)
+    parts = RodProperties(1e-2, 500.0, 0.05, profile=(1.0,) * 6)
+    points = crumpled(4, rest)
+    assert Rod(rest, one, 0.004).velocities(points, points, GRAVITY, FREE).tobytes() == Rod(
+        rest, parts, 0.004).velocities(points, points, GRAVITY, FREE).tobytes()
+
+
+def test_a_rod_takes_the_length_that_its_scale_says():
+    rest = np.array([0.03, 0.05, 0.02, 0.06])
+    rod = Rod(rest, RodProperties(1e-2, 500.0, 0.05, length_scale=1.1), 0.004)
+    assert np.abs(rod.velocities(1.1 * straight(rest), np.zeros((5, 3)), NONE, FREE)).max() < 1e-9
+    velocities = rod.velocities(straight(rest), np.zeros((5, 3)), NONE, FREE)
+    assert velocities[-1, 0] - velocities[0, 0] > 0.1  # it is compressed
+    assert rod.masses.sum() == pytest.approx(0.05)
+
+
+def test_markers_add_their_mass_where_they_are():
+    features = np.array([0, 0.25, 0.75, 0, 1.0])
+    rest = np.full(4, 0.05)
+    plain = Rod(rest, CABLE, 0.004).masses
+    marked = Rod(rest, RodProperties(1e-2, 500.0, 0.05, marker_mass=0.02), 0.004, features).masses
+    assert marked - plain == pytest.approx(0.02 * features)
+
+
+def test_a_weight_at_the_end_of_a_hanging_rod_stretches_it():
+    rest = splits('even')
+    properties = RodProperties(1e-3, 20.0, 0.05 * rest.sum(), 5.0, 0.2, marker_mass=0.1)
+    rod = Rod(rest, properties, 0.2, np.eye(len(rest) + 1)[-1])
+    points = straight(rest) @ np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    stretch = -rest_of(rod, points, (0,), GRAVITY)[-1, 2] - rest.sum()
+    assert stretch == pytest.approx(9.81 * (0.05 * rest.sum() / 2 + 0.1) * rest.sum() / 20.0, rel=0.002)
+
+
 def test_held_nodes_follow_their_velocities():
     rest = np.full(10, 0.05)
     rod = Rod(rest, CABLE, 0.004)

@@ -1,0 +1,149 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The compiled engine against the one that it stands for: each kernel step by step, whole trials too."""
+
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from test_rod import crumpled, GRAVITY, straight
+
+from dlo_calibration import Chain, kernels, PARAMETERS, ParameterSpace, SimulationError
+from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration.config import Options
+from dlo_calibration.contact import SelfContact
+from dlo_calibration.layout import Layout
+from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.trial import Trial
+
+SAMPLES = Path(__file__).parents[1] / 'msg_samples'
+STEP = 0.004
+NAMES = tuple(parameter.name for parameter in PARAMETERS)
+
+
+def some_properties(generator, curvature):
+    return RodProperties(
+        10**generator.uniform(-5, -1), 10**generator.uniform(1, 4), 0.05, generator.uniform(0, 10),
+        generator.uniform(0, 0.05), generator.uniform(0.9, 1.1), curvature, generator.uniform(0, 0.01),
+        (1.0, *generator.uniform(0.2, 5, generator.integers(0, 6))))
+
+
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 40), st.integers(0, 5),
+       st.one_of(st.just(0.0), st.floats(0.01, 10)), st.floats(0.02, 1))
+def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, size):
+    generator = np.random.default_rng(seed)
+    rest = generator.uniform(0.01, 0.05, segments)
+    points = crumpled(seed, rest, size)
+    count = len(points)
+    velocities = generator.normal(size=points.shape)
+    nodes = np.sort(generator.choice(count, min(held, count - 1), replace=False))
+    follow = generator.normal(size=(len(nodes), 3))
+    rod = Rod(rest, some_properties(generator, curvature), STEP, generator.uniform(0, 1, count))
+    rod.hold(nodes)
+    expected = rod.velocities(points, velocities, GRAVITY, follow)
+    expected[nodes] = follow
+    got = np.empty_like(points)
+    assert kernels.rod_velocities(
+        points, velocities + STEP * GRAVITY, got, nodes.astype(np.int64), follow, rod.rest_lengths,
+        rod.stiffness, rod.masses, rod.bending, rod.natural, rod.drag, rod.implicit, STEP,
+        np.empty((3 * count + 6, 7)), np.empty(3 * count + 6))
+    assert np.abs(got - expected).max() < 1e-8 * max(1, np.abs(expected).max())
+
+
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(8, 30), st.floats(0.003, 0.02), st.floats(0, 2), st.booleans())
+def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius, friction, supported):
+    generator = np.random.default_rng(seed)
+    rest = np.full(segments, 0.02)
+    turns = np.cumsum(generator.normal(0, 0.6, segments))  # a tangle in a thin layer
+    points = np.concatenate([[[0.0, 0, 0]], np.cumsum(0.02 * np.stack(
+        [np.cos(turns), np.sin(turns), generator.normal(0, 0.2, segments)], axis=1), axis=0)])
+    velocities = generator.normal(0, 0.5, points.shape)
+    inverse = generator.uniform(0.5, 2, len(points)) * (generator.random(len(points)) > 0.1)
+    support = generator.normal(0, 0.05, points.shape) * supported
+    places = np.concatenate([[0.0], np.cumsum(rest)])
+    contact = SelfContact(places, radius, friction, STEP)
+    contact.start(points + generator.normal(0, 0.002, points.shape))
+    expected = contact.velocities(points, velocities, inverse, support)
+
+    generator = np.random.default_rng(seed)  # the same start once more
+    generator.normal(0, 0.6, segments), generator.normal(0, 0.2, segments)
+    generator.normal(0, 0.5, points.shape), generator.uniform(0.5, 2, len(points))
+    generator.random(len(points)), generator.normal(0, 0.05, points.shape)
+    begun = points + generator.normal(0, 0.002, points.shape)
+    pairs = np.empty((segments * (segments - 1) // 2, 2), np.int64)
+    distances, middles = np.empty((segments, segments)), places[:-1] + rest / 2
+    apart = max(np.pi * radius, rest.max() / 2)
+    kernels.start_distances(begun, middles, rest / 2, apart, 2 * radius, pairs, distances)
+    count = kernels.near_pairs(points, middles, rest / 2, apart, 2 * radius, 1.5, 1.0, pairs)
+    got = velocities.copy()
+    kernels.resolve(points, got, inverse, support, pairs[:count], distances, 2 * radius, friction, STEP,
+                    np.empty((len(pairs), kernels.CONTACT_COLUMNS)), np.empty_like(points))
+    assert got == pytest.approx(expected, abs=1e-9)
+
+
+def sample(name, marked=()):
+    """Return the trials of a sample, with some points marked as features, and its options."""
+    session = read_session(SAMPLES / name, None)
+    options = Options.of(session.options or {})
+    trials, _ = session_trials(session, options)
+    features = np.isin(np.arange(len(trials[0].initial)), marked)
+    return [Trial(trial.name, Chain(trial.initial.points, trial.initial.hands, features), trial.actions,
+                  trial.goals, trial.velocity) for trial in trials], options
+
+
+@pytest.mark.parametrize('name', ['object2', 'object4'])
+def test_a_trial_is_what_it_is_in_bullet(name):
+    trials, options = sample(name, (3, 10))
+    generator = np.random.default_rng(5)
+    space = ParameterSpace(NAMES, {}, options.mass)
+    with_table = {'table': True, 'table_height': options.table_height, 'settle_limit': 1.0}
+    bullet, compiled = BulletSimulator(**with_table), CompiledSimulator(**with_table)
+    for trial in trials[:3]:
+        # A DLO that is too long for where it lies buckles: any rounding decides to which side.
+        values = {**space.values(generator.random(len(NAMES))), 'length_scale': generator.uniform(30, 48)}
+        physical = {**space.physical(values, trial.initial.length), 'self_collision': 0.004}
+        expected, got = (one.simulate(trial, physical) for one in (bullet, compiled))
+        assert np.linalg.norm(got.chains - expected.chains, axis=-1).mean() < 1e-6
+        assert (got.steps, got.settled) == (expected.steps, expected.settled)
+    bullet.close()
+
+
+def test_a_rollout_that_diverges_ends_at_once():
+    rope = CompiledRope(11, STEP)
+    rest = np.full(10, 0.05)
+    points = straight(rest)
+    physical = ParameterSpace().physical({}, 0.5)
+    rope.reset(np.concatenate([[0.0], np.cumsum(rest)]), points, 1e200 * crumpled(0, rest), physical, None)
+    with pytest.raises(SimulationError, match='diverged'):
+        rope.advance(np.zeros((10**9, 0, 3)))
+
+
+def test_a_layout_is_known_until_the_simulator_is_closed():
+    trials, options = sample('object2')
+    simulator = CompiledSimulator(settle_limit=0.5)
+    physical = ParameterSpace(mass=options.mass).physical({}, 0.5)
+    first = simulator.simulate(trials[0], physical).chains
+    other = sample('object2', (5,))[0][0]
+    heavy = simulator.simulate(other, {**physical, 'marker_mass': 0.1}).chains
+    assert np.abs(heavy - first).max() > 1e-4
+    assert Layout.of(other, 31).features.sum() == pytest.approx(1)
+    simulator.close()
+    assert simulator.simulate(trials[0], physical).chains.tobytes() == first.tobytes()

@@ -1,0 +1,146 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A DLO that is coiled: its energy and forces, and the circle that it curls to."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from test_rod import crumpled, energy, FREE, NONE, straight
+
+from dlo_calibration.natural import natural_forces
+from dlo_calibration.rod import Rod, RodProperties
+
+
+def coiled(curvature, **rest):
+    return RodProperties(2e-3, 1e4, 0.05, 1.0, 0.05, natural_curvature=curvature, **rest)
+
+
+def bent(rest, seed=0):
+    """Return a rod that is slightly bent, in a plane that is no coordinate plane."""
+    turned = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    points = straight(rest)
+    points[:, 1] += 0.05 * points[:, 0]**2
+    return points @ turned
+
+
+def go_on(rod, points, steps=3000, step=0.004):
+    velocities = np.zeros_like(points)
+    for _ in range(steps):
+        velocities = rod.velocities(points, velocities, NONE, np.zeros((len(rod.held), 3)))
+        points = points + step * velocities
+    return points, velocities
+
+
+def circle(points):
+    """Return the radius of the circle through the first, middle and last of three points."""
+    a, b, c = points
+    area = np.linalg.norm(np.cross(b - a, c - a)) / 2
+    return np.linalg.norm(a - b) * np.linalg.norm(b - c) * np.linalg.norm(c - a) / (4 * area)
+
+
+@pytest.mark.parametrize(('curvature', 'equal'), [(0.5, True), (5.0, True), (3.0, False)])
+def test_a_free_coiled_rod_curls_to_its_circle(curvature, equal):
+    rest = np.full(24, 0.04) if equal else np.random.default_rng(1).uniform(0.02, 0.06, 24)
+    points, velocities = go_on(Rod(rest, coiled(curvature), 0.004), bent(rest))
+    assert np.abs(velocities).max() < 1e-4
+    for k in range(len(points) - 4):
+        assert circle(points[[k, k + 2, k + 4]]) == pytest.approx(1 / curvature, rel=0.01)
+    flat = np.linalg.svd(points - points.mean(axis=0))[1]
+    assert flat[2] < 1e-3 * flat[0]  # it lies in a plane
+
+
+def test_a_coiled_weightless_cantilever_takes_the_arc():
+    rest = np.concatenate([[0.01], np.full(30, 0.02)])
+    rod = Rod(rest, coiled(2.5), 0.004)
+    rod.hold((0, 1))
+    points = straight(rest)
+    points[2:, 1] += 0.05 * (points[2:, 0] - 0.01)**2
+    points, _ = go_on(rod, points)
+    along = np.cumsum(rest) - 0.01
+    turned = 2.5 * along
+    expected = np.stack([0.01 + np.sin(turned) / 2.5, (1 - np.cos(turned)) / 2.5, 0 * along], axis=1)
+    assert np.abs(points[1:] - expected).max() < 0.003
+
+
+def natural_energy(points, moments):
+    """Energy of the natural curvature, with a frame that is carried from segment to segment."""
+    segments = np.diff(points, axis=0)
+    tangents = segments / np.linalg.norm(segments, axis=1)[:, None]
+    direction = np.cross(tangents[0], [0.3, 0.2, 0.9])
+    direction /= np.linalg.norm(direction)
+    total = np.zeros(2)
+    for a, b, moment in zip(tangents[:-1], tangents[1:], moments, strict=True):
+        sideways = np.cross(a, direction)
+        total += moment * np.array([b @ direction, b @ sideways]) / np.sqrt((1 + a @ b) / 2)
+        direction = direction - (b @ direction) / (1 + a @ b) * (a + b)
+    return -np.sqrt(total @ total + (0.05 * moments.mean())**2)
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_forces_of_the_natural_curvature_are_the_slope_of_its_energy(seed, wild):
+    generator = np.random.default_rng(seed)
+    rest = generator.uniform(0.02, 0.08, 7)
+    points = crumpled(seed, rest, 0.7 if wild else 0.1)
+    moments = generator.uniform(0.5, 2, 6)
+    segments = np.diff(points, axis=0)
+    got = natural_forces(segments, np.linalg.norm(segments, axis=1), moments)
+    expected = np.zeros_like(points)
+    for index in np.ndindex(points.shape):
+        moved = np.zeros_like(points)
+        moved[index] = 1e-6
+        expected[index] = -(natural_energy(points + moved, moments)
+                            - natural_energy(points - moved, moments)) / 2e-6
+    assert got == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 10.0), st.sampled_from([0.001, 0.004]))
+def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step):
+    rest = np.random.default_rng(seed).uniform(0.02, 0.05, 15)
+    properties = RodProperties(bending, 1e3, 0.05, natural_curvature=curvature)
+    rod = Rod(rest, properties, step)
+    points = crumpled(seed, rest, 0.1)
+    velocities = np.zeros_like(points)
+
+    def total():
+        return energy(points, rest, properties) + natural_energy(points, rod.natural) + (
+            rod.masses[:, None] * velocities**2).sum() / 2 + (
+                (curvature**2 * properties.bending_stiffness * rest.sum()) / 2)
+
+    start = total()
+    for _ in range(150):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + step * velocities
+        assert total() < 1.05 * start
+    assert total() < start
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_a_coiled_rod_neither_flies_away_nor_begins_to_spin(seed):
+    rest = np.random.default_rng(seed).uniform(0.02, 0.05, 12)
+    rod = Rod(rest, RodProperties(1e-3, 1e3, 0.05, natural_curvature=5.0), 1e-7)
+    points = crumpled(seed, rest, 0.3)
+    pushed = rod.masses[:, None] * rod.velocities(points, np.zeros_like(points), NONE, FREE) / 1e-7
+    assert np.abs(pushed.sum(axis=0)).max() < 1e-6 * np.abs(pushed).max()
+    assert np.abs(np.cross(points, pushed).sum(axis=0)).max() < 1e-5 * np.abs(pushed).max()
+
+
+def test_a_coiled_rod_that_is_straight_stays_so_until_something_bends_it():
+    rest = np.full(12, 0.03)
+    velocities = Rod(rest, coiled(5.0), 0.004).velocities(straight(rest), np.zeros((13, 3)), NONE, FREE)
+    assert np.abs(velocities).max() < 1e-9
