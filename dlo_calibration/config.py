@@ -131,7 +131,7 @@ class Options:
     nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
     time_step: float = _option(0.004, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
     stable_distance: float = _option(
-        0.0002, 'a DLO is stable when all its points moved less than this within stable_time',
+        0.0005, 'a DLO is stable when all its points moved less than this within stable_time',
         unit='m', minimum=1e-6, maximum=0.1)
     stable_time: float = _option(0.25, 'see stable_distance', unit='s', minimum=0.01, maximum=60.0)
     settle_limit: float = _option(10.0, 'give up waiting for a stable DLO after that long (simulated)',

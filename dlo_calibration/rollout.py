@@ -51,7 +51,7 @@ class Settling:
     :param limit: after that long [s] it is given up.
     """
 
-    distance: float = 0.0002
+    distance: float = 0.0005
     time: float = 0.25
     limit: float = 10.0
 
