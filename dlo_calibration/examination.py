@@ -32,7 +32,8 @@ from dlo_calibration.score import PointErrors
 from dlo_calibration.uncertainty import from_jacobian, left_out, optimum_shift, predictive_std, Uncertainty
 
 STEP = 0.03  # of the central differences, in the unit cube; contacts that come and go are smaller
-WIDEST = 0.25  # a parameter that is known badly is moved as far as it is unknown, but no further
+SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:
+WIDE, WIDEST = 0.1, 0.25  # as far as it is unknown, within these
 WIDENINGS = 2
 OUTLIER = 1.5  # standard deviations at which residuals are cut off
 ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
@@ -95,14 +96,18 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
                          for k in range(dimension)], axis=1)
     for _ in range(WIDENINGS):
         std = from_jacobian(point, residuals, jacobian, shapes, noise=noise).std
-        weak = np.flatnonzero(np.minimum(std, WIDEST) > 2 * steps)
+        wider = np.where(std > SUSPECT, np.clip(std, WIDE, WIDEST), steps)
+        weak = np.flatnonzero(wider > 1.5 * steps)
         if not len(weak):
             break
-        steps[weak] = np.minimum(std[weak], WIDEST)
+        steps[weak] = wider[weak]
         beside = np.concatenate([_beside(point, k, steps[k]) for k in weak])
         seen = list(residuals_at(beside))
         for j, k in enumerate(weak):
-            jacobian[:, k] = _column(residuals, point[k], beside[2 * j:2 * j + 2, k], seen[2 * j:2 * j + 2])
+            column = _column(residuals, point[k], beside[2 * j:2 * j + 2, k], seen[2 * j:2 * j + 2])
+            # A small difference may show a kink where there is no slope: the lesser effect is believed.
+            if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
+                jacobian[:, k] = column
     cross_validated = float('nan')
     if len(shapes) > 1:
         cross_validated = _cross_validated(point, residuals, jacobian, shapes, residuals_at)

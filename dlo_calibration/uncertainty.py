@@ -48,6 +48,7 @@ AT_BOUND = 0.002
 MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
 FEWEST_TRIALS = 3  # whose disagreement says something
 SMALLEST_RESIDUAL = 1e-9  # m; of a model that explains everything
+REMAINING = 2.0  # times what a simulation twice as fine changes is what is missing, of an error of first order
 INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
 ROBUST = 1.5  # deviations beyond which a residual counts less (Huber, Robust Statistics, 1981, 4.5)
 CAPPED = 0.7785  # mean square of a standard normal value that is cut off there
@@ -186,7 +187,7 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
         disagreement = np.var(left_out(right, matrix, shapes, prior), axis=0) * (len(shapes) - 1)
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
-        extra = extra + shift**2
+        extra = extra + (REMAINING * shift)**2
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
     # None is known worse than a value that may be anything.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
