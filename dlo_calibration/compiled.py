@@ -83,7 +83,7 @@ class CompiledRope:
         self._constants = np.array([
             self._rod.drag, self._rod.implicit, self.time_step, GRAVITY,
             NOWHERE if level is None else level, physical['friction'], diameter, apart, -1.0, 0.0])
-        self._let_go()
+        self.hold(())
 
     @property
     def points(self) -> Floats:
@@ -92,17 +92,10 @@ class CompiledRope:
 
     def hold(self, nodes: tuple[int, ...]) -> None:
         """Let exactly these nodes follow a path from now on."""
-        self._let_go()
-        if nodes:
-            self._held = np.array(nodes, np.int64)
-            self._rod.hold(nodes)
-            self._inverse_masses[self._held] = 0.0
-
-    def _let_go(self) -> None:
-        if len(self._rod.held):
-            self._rod.hold(())
-        self._held = self._rod.held
+        self._held = np.array(nodes, np.int64)
+        self._rod.hold(nodes)
         self._inverse_masses = 1 / self._rod.masses
+        self._inverse_masses[self._held] = 0.0
 
     def advance(self, targets: Floats) -> None:
         """
@@ -114,7 +107,7 @@ class CompiledRope:
         taken = kernels.advance(
             np.ascontiguousarray(targets), self._held, self._points, self._velocities, self._support,
             rod.rest_lengths, rod.stiffness, rod.masses, self._inverse_masses, rod.bending, rod.natural,
-            self._distances, self._pairs, self._contacts, self._bands, self._right, self._wanted,
+            rod.spans, self._distances, self._pairs, self._contacts, self._bands, self._right, self._wanted,
             self._change, self._constants)
         if taken < len(targets):
             raise SimulationError('the rollout diverged: the chain is no longer finite')

@@ -40,6 +40,7 @@ from dlo_calibration.contact import (
 )
 from dlo_calibration.natural import HAIRPIN, ROUNDED
 from dlo_calibration.rod import HELD
+from dlo_calibration.twist import ANGLE, BEGUN, COLUMNS, END, FIRST, LAST, START, STIFFNESS
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
 
@@ -93,6 +94,22 @@ def _solve(bands: Floats, right: Floats) -> bool:
     return math.isfinite(total)
 
 
+@_compiled(f'void({VECTOR}, {VECTOR}, {VECTOR})')
+def _carry(frame: Floats, before: Floats, tangent: Floats) -> None:
+    """Turn `frame` (3,), perpendicular to `before` (3,), by the smallest rotation to another tangent (3,)."""
+    cosine = before[0] * tangent[0] + before[1] * tangent[1] + before[2] * tangent[2]
+    along = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]
+    share = along / max(1.0 + cosine, 2 * HAIRPIN)
+    for c in range(3):
+        frame[c] -= share * (before[c] + tangent[c])
+    left = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]  # nothing but in a hairpin
+    for c in range(3):
+        frame[c] -= left * tangent[c]
+    size = math.sqrt(frame[0]**2 + frame[1]**2 + frame[2]**2)
+    for c in range(3):
+        frame[c] /= size
+
+
 @_compiled(f'void({MATRIX}, {VECTOR}, f8, {VECTOR})')
 def add_natural(points: Floats, moments: Floats, step: float, right: Floats) -> None:
     """Add to `right` (3 N,) the impulses [N s] of the natural curvature; see `natural.natural_forces`."""
@@ -123,15 +140,8 @@ def add_natural(points: Floats, moments: Floats, step: float, right: Floats) -> 
         x = b[0] * a[3] + b[1] * a[4] + b[2] * a[5]
         y = (b[0] * (a[1] * a[5] - a[2] * a[4]) + b[1] * (a[2] * a[3] - a[0] * a[5])
              + b[2] * (a[0] * a[4] - a[1] * a[3]))
-        share = x / (2 * a[half]**2)
-        for c in range(3):
-            b[frame + c] = a[frame + c] - share * (a[c] + b[c])
-        left = b[0] * b[3] + b[1] * b[4] + b[2] * b[5]  # nothing but in a hairpin
-        for c in range(3):
-            b[frame + c] -= left * b[c]
-        size = math.sqrt(b[3]**2 + b[4]**2 + b[5]**2)
-        for c in range(3):
-            b[frame + c] /= size
+        b[frame:frame + 3] = a[frame:frame + 3]
+        _carry(b[frame:frame + 3], a[:3], b[:3])
         a[bend], a[bend + 1] = x / a[half], y / a[half]
         total_x += moments[i] * a[bend]
         total_y += moments[i] * a[bend + 1]
@@ -174,17 +184,79 @@ def add_natural(points: Floats, moments: Floats, step: float, right: Floats) -> 
             right[3 * i + c] -= impulse
 
 
+@_compiled(f'void({MATRIX}, {MATRIX}, f8, {VECTOR})')
+def add_twist(points: Floats, spans: Floats, step: float, right: Floats) -> None:
+    """Add to `right` (3 N,) the impulses [N s] of twist between clamps; see `twist.twist_forces`."""
+    n = len(points) - 1
+    tangents, torques = np.empty((n, 3)), np.zeros((n, 3))
+    lengths = np.empty(n)
+    for i in range(n):
+        for c in range(3):
+            tangents[i, c] = points[i + 1, c] - points[i, c]
+        lengths[i] = math.sqrt(tangents[i, 0]**2 + tangents[i, 1]**2 + tangents[i, 2]**2)
+        for c in range(3):
+            tangents[i, c] /= lengths[i]
+    frame, there = np.empty(3), np.empty(3)
+    for k in range(len(spans)):
+        span = spans[k]
+        a, b = int(span[FIRST]), int(span[LAST])
+        if span[BEGUN] == 0.0:
+            span[START:START + 3] = tangents[a]
+            least = 0
+            for c in range(1, 3):
+                if abs(tangents[a, c]) < abs(tangents[a, least]):
+                    least = c
+            one, two = (least + 1) % 3, (least + 2) % 3
+            size = math.hypot(tangents[a, one], tangents[a, two])
+            span[START + 3 + one], span[START + 3 + two] = tangents[a, two] / size, -tangents[a, one] / size
+        frame[:] = span[START + 3:END]
+        _carry(frame, span[START:START + 3], tangents[a])
+        for i in range(a, b):
+            _carry(frame, tangents[i], tangents[i + 1])
+        if span[BEGUN] == 0.0:
+            span[BEGUN] = 1.0
+            span[END:END + 3] = tangents[b]
+            span[END + 3:COLUMNS] = frame
+        there[:] = span[END + 3:COLUMNS]
+        _carry(there, span[END:END + 3], tangents[b])
+        x, y = 0.0, 0.0
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            x += frame[c] * there[c]
+            y += tangents[b, c] * (frame[d] * there[e] - frame[e] * there[d])
+        angle = math.atan2(y, x)
+        angle += 2 * math.pi * round((span[ANGLE] - angle) / (2 * math.pi))
+        span[ANGLE] = angle
+        for i in range(a, b):
+            square = 0.0
+            for c in range(3):
+                square += (tangents[i, c] + tangents[i + 1, c])**2
+            share = span[STIFFNESS] * angle / max(square / 2, 2 * HAIRPIN)
+            for c in range(3):
+                joint = share * (tangents[i, c] + tangents[i + 1, c])
+                torques[i + 1, c] -= joint
+                torques[i, c] += joint
+    for i in range(n):
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            impulse = step * (torques[i, d] * tangents[i, e] - torques[i, e] * tangents[i, d]) / lengths[i]
+            right[3 * i + 3 + c] += impulse
+            right[3 * i + c] -= impulse
+
+
 @_compiled(f'boolean({MATRIX}, {MATRIX}, {MATRIX}, {INDICES}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, {VECTOR}, f8, f8, f8, {MATRIX}, {VECTOR})')
+           f' {MATRIX}, {VECTOR}, {MATRIX}, f8, f8, f8, {MATRIX}, {VECTOR})')
 def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any, follow: Floats,
                    rest: Floats, stiffness: Floats, masses: Floats, bending: Floats, natural: Floats,
-                   drag: float, implicit: float, step: float, bands: Floats, right: Floats) -> bool:
+                   spans: Floats, drag: float, implicit: float, step: float, bands: Floats,
+                   right: Floats) -> bool:
     """
     Put the velocities after one step into `wanted`; see `rod.Rod.velocities`.
 
     Gravity is added by the caller, in `velocities`.
 
     :param natural: (N - 2,) [N m] as `rod.Rod.natural`; (0,): straight at rest.
+    :param spans: (s, COLUMNS) as `rod.Rod.spans`.
     :param bands: (3 N + 6, 7), workspace.
     :param right: (3 N + 6,), workspace.
     :returns: False where the rollout diverges.
@@ -250,6 +322,8 @@ def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any
         bands[j + 2, 3] -= zz
     if len(natural) > 0:
         add_natural(points, natural, step, right)
+    if len(spans) > 0:
+        add_twist(points, spans, step, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
         for c in range(3):
@@ -470,12 +544,12 @@ def rest_on_table(points: Floats, velocities: Floats, level: float, friction: fl
 
 
 @_compiled(f'i8(f8[:,:,::1], {INDICES}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, {VECTOR}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX},'
-           f' {VECTOR})')
+           f' {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX},'
+           f' {MATRIX}, {VECTOR})')
 def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, support: Floats, rest: Floats,
             stiffness: Floats, masses: Floats, inverse_masses: Floats, bending: Floats, natural: Floats,
-            distances: Floats, pairs: Any, contacts: Floats, bands: Floats, right: Floats, wanted: Floats,
-            change: Floats, constants: Floats) -> int:
+            spans: Floats, distances: Floats, pairs: Any, contacts: Floats, bands: Floats, right: Floats,
+            wanted: Floats, change: Floats, constants: Floats) -> int:
     """
     Take k steps; everything but `targets` (k, h, 3) [m] is the state, see `compiled.CompiledRope`.
 
@@ -495,7 +569,7 @@ def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, supp
         for i in range(n):
             velocities[i, 2] -= step * gravity
         if not rod_velocities(points, velocities, wanted, held, follow, rest, stiffness, masses, bending,
-                              natural, drag, implicit, step, bands, right):
+                              natural, spans, drag, implicit, step, bands, right):
             return k
         fastest = 0.0
         for i in range(n):

@@ -58,7 +58,7 @@ def natural_forces(segments: Floats, lengths: Floats, moments: Floats) -> Floats
     tangents = segments / lengths[:, None]
     first, second = tangents[:-1], tangents[1:]
     half = np.sqrt(np.maximum((1 + np.einsum('ij,ij->i', first, second)) / 2, HAIRPIN))
-    directions = _frame(tangents)
+    directions = frame_along(tangents)
     sideways = np.cross(tangents, directions)
     bends = np.stack([np.einsum('ij,ij->i', second, axis[:-1]) for axis in (directions, sideways)]) / half
     least = bends @ moments
@@ -82,7 +82,7 @@ def natural_forces(segments: Floats, lengths: Floats, moments: Floats) -> Floats
     return forces
 
 
-def _frame(tangents: Floats) -> Floats:
+def frame_along(tangents: Floats) -> Floats:
     """Return (N - 1, 3) unit vectors perpendicular to the tangents that do not twist about them."""
     some = np.cross(tangents, np.eye(3)[np.abs(tangents).argmin(axis=1)])
     some /= np.linalg.norm(some, axis=1, keepdims=True)

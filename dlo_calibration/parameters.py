@@ -110,6 +110,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('marker_mass', 'mass at each point annotated as feature', 'kg', 1e-6, 1e-1, 0.0,
               'how heavy a marker or plug is, beside the DLO (0: nothing)', per_weight=True,
               neutral=0.0),
+    Parameter('torsion', 'twisting stiffness GJ by bending stiffness EI', '1', 1e-2, 1e1, 0.0,
+              'how much the DLO resists twist between two clamps (0: not at all)', neutral=0.0),
     *(Parameter(part_name(part), f'bending stiffness of part {part} by that of part 1', '1', 0.02, 50.0, 50.0,
                 f'how stiff part {part} of the DLO is, of as many equal parts as there are', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),

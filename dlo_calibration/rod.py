@@ -31,8 +31,9 @@ not (at 0.5 the stiffest modes would ring for ever): the damping is then less th
 time step's.  The part of the stretching matrix that a compressed spring makes
 negative is left out, so that the matrix stays positive definite.
 
-A DLO with natural curvature: see `natural`.  Parts of different stiffness: an inner
-node has the stiffness of the pieces on its two sides in series.
+A DLO with natural curvature: see `natural`; one that resists twist: see `twist`.
+Parts of different stiffness: an inner node has that of the pieces on its two sides
+in series.
 """
 
 from __future__ import annotations
@@ -49,11 +50,13 @@ from dlo_calibration.chain import Floats
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.natural import natural_forces
 from dlo_calibration.parameters import PART_NAMES
+from dlo_calibration.twist import COLUMNS, spans_between, twist_forces
 
 Indices = NDArray[np.intp]
 
 BANDS = 7  # diagonal and six below it: node i couples to i + 2, three coordinates each
 IMPLICIT = 0.6  # see the module
+TINY = 1e-12
 HELD = 1e12  # a held node's share of the matrix, relative to its mass
 
 
@@ -70,6 +73,7 @@ class RodProperties:
     :param length_scale: rest lengths relative to the observed ones.
     :param natural_curvature: at rest [1/m].
     :param marker_mass: at each point annotated as feature [kg].
+    :param torsion: twisting stiffness relative to the bending stiffness.
     :param profile: bending stiffness of equal parts of the length, relative to the first one's.
     """
 
@@ -81,6 +85,7 @@ class RodProperties:
     length_scale: float = 1.0
     natural_curvature: float = 0.0
     marker_mass: float = 0.0
+    torsion: float = 0.0
     profile: tuple[float, ...] = (1.0,)
 
     @classmethod
@@ -96,7 +101,8 @@ class RodProperties:
                    internal_damping=physical['internal_damping'],
                    length_scale=physical.get('length_scale', 1.0),
                    natural_curvature=physical.get('natural_curvature', 0.0),
-                   marker_mass=physical.get('marker_mass', 0.0), profile=profile)
+                   marker_mass=physical.get('marker_mass', 0.0),
+                   torsion=physical.get('torsion', 0.0), profile=profile)
 
 
 class Rod:
@@ -129,9 +135,11 @@ class Rod:
         self.drag = properties.drag
         self._bending_stiffness = properties.bending_stiffness
         self._natural_curvature = properties.natural_curvature
+        self._torsion = properties.torsion
         self._profile = np.array(properties.profile)
         #: c of the step [s^2], see the module
         self.implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
+        self.spans = np.zeros((0, COLUMNS))
         self.hold(())
 
     def hold(self, nodes: Sequence[int]) -> None:
@@ -153,6 +161,9 @@ class Rod:
         self.natural: Floats = np.zeros(0)
         if self._natural_curvature and not rigid.all():
             self.natural = self._natural_curvature * np.where(rigid[:-1] & rigid[1:], 0.0, stiffnesses)
+        #: what twists between clamps, see `twist`; empty of a DLO that does not resist twist
+        compliances = self._compliances(rigid, stiffnesses)
+        self.spans = spans_between(rigid & (self._torsion > 0), compliances, self.spans)
         self._constant: Floats | None = None
 
     @property
@@ -180,6 +191,8 @@ class Rod:
         forces = -self._bend(points)
         if len(self.natural):
             forces += natural_forces(segments, lengths, self.natural)
+        if len(self.spans):
+            forces += twist_forces(segments, lengths, self.spans)
         forces[:-1] += tensions
         forces[1:] -= tensions
         right = self.masses[:, None] * (velocities + step * gravity) + step * forces
@@ -227,6 +240,12 @@ class Rod:
         cells = bendable[:-1] + bendable[1:]
         stiffness *= np.divide(cells, total, out=np.ones_like(total), where=total > 0)
         return stiffness
+
+    def _compliances(self, rigid: NDArray[np.bool_], stiffnesses: Floats) -> Floats:
+        """Return the angle per torque of twist at each inner node, (N - 2,) [1/(N m)]."""
+        bendable = np.where(rigid, 0.0, self.rest_lengths)
+        compliances: Floats = (bendable[:-1] + bendable[1:]) / (2 * max(self._torsion, TINY) * stiffnesses)
+        return compliances
 
     def _constant_bands(self) -> Floats:
         """Return the part of the matrix that stays the same until other nodes are held, (BANDS, N, 3)."""

@@ -37,7 +37,7 @@ ORDER = (
     'collector', 'recording', 'xml', 'description',
     'request', 'session',
     # engines
-    'rollout', 'contact', 'natural', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
+    'rollout', 'contact', 'natural', 'twist', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
     'pool', 'cluster', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
     'options_node', 'node',
