@@ -39,6 +39,7 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 
 from discretisation import exact_trials  # noqa: E402
+
 from dlo_calibration import Chain, ParameterSpace, Trial  # noqa: E402
 from dlo_calibration.calibration import calibrate, Evaluator  # noqa: E402
 from dlo_calibration.compiled import CompiledSimulator  # noqa: E402
@@ -102,7 +103,8 @@ def draw(name: str, seed: int) -> Draw:
 
 def main() -> None:
     """Make the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--draws', type=int, default=100)
     parser.add_argument('--workers', type=int, default=2)
     options = parser.parse_args()
@@ -135,10 +137,11 @@ def main() -> None:
                 f'| {np.median([one.seconds for one in draws]):.1f} |')
             print(*rows[-4:], fits[-1], sep='\n', flush=True)
     text = (
-        f'# intervals\n\n`python benchmark/intervals.py --draws {options.draws}`: {options.draws} draws of the '
-        'noise for each object. The mean distance that noise alone makes is 1.6 mm.\n\n'
+        f'# intervals\n\n`python benchmark/intervals.py --draws {options.draws}`: {options.draws} draws of '
+        'the noise for each object. The mean distance that noise alone makes is 1.6 mm.\n\n'
         + '\n'.join(rows) + '\n\nOver all but self_collision, '
-        f'{100 * np.mean(inside):.0f} % of the 90 % intervals contain the truth.\n\n' + '\n'.join(fits) + '\n')
+        f'{100 * np.mean(inside):.0f} % of the 90 % intervals contain the truth.\n\n'
+        + '\n'.join(fits) + '\n')
     (HERE / 'results' / 'intervals.md').write_text(text, encoding='utf-8')
     print(text.split('\n\n')[-2])
 

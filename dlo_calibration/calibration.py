@@ -41,6 +41,8 @@ from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, matters_below, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
+EXACT = 1e-9  # relative error of a length that does not matter
+LENGTH_ENDS = float(np.sqrt(2.0))  # standard deviation of a length, in those of its two ends
 
 
 @dataclass(frozen=True)
@@ -303,15 +305,10 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
                               f'none of {len(kept)} evaluations could be simulated: {best.failure}')
     examination = None
     if not stopped:
-        finer = simulator.refined()
         try:
-            examination, best = _examined(
-                evaluate, None if finer is None else everywhere(Evaluator(trials, space, finer)), best)
+            examination, best = _examined(evaluate, everywhere, best)
         except CancelledError:
             stopped = True
-        finally:
-            if finer is not None:
-                finer.close()
     reason = 'stopped on request' if stopped else \
         search.stop_reason or f'budget of {budget} evaluations spent'
     found = spread_of_best(kept, best.point)
@@ -354,7 +351,7 @@ def _searched(evaluate: _Everywhere, search: Search, budget: int,
     return kept, best, stopped
 
 
-def _examined(evaluate: _Everywhere, finer: _Everywhere | None,
+def _examined(evaluate: _Everywhere, everywhere: Callable[[Evaluator], _Everywhere],
               best: Evaluation) -> tuple[Examination, Evaluation]:
     """
     Return what is around the best evaluation, and that evaluation as it is reported.
@@ -363,13 +360,22 @@ def _examined(evaluate: _Everywhere, finer: _Everywhere | None,
 
     :raises CancelledError: when stopped.
     """
-    trials, space = evaluate.evaluator.trials, evaluate.evaluator.space
+    evaluator = evaluate.evaluator
+    trials, space, simulator = evaluator.trials, evaluator.space, evaluator.simulator
     assert best.residuals is not None
-    default = space.default_point()
-    examination = examine(
-        best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
-        evaluate.residuals, default=default, noise=noise(trials),
-        finer=None if finer is None else finer.residuals)
+    default, sigma = space.default_point(), noise(trials)
+    finer = simulator.refined()
+    error = LENGTH_ENDS * sigma / mean_length(trials)  # of the measured length, relative
+    try:
+        examination = examine(
+            best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
+            evaluate.residuals, default=default, noise=sigma,
+            finer=None if finer is None else everywhere(Evaluator(trials, space, finer)).residuals,
+            longer=None if not error > EXACT or 'length_scale' in space.free else everywhere(
+                Evaluator(trials, space.lengthened(1 + error), simulator)).residuals)
+    finally:
+        if finer is not None:
+            finer.close()
     excited = examination.uncertainty.excited
     point = np.where(excited, best.point, default)
     if np.array_equal(point, best.point):

@@ -72,7 +72,8 @@ class Examination:
 
 
 def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]], evaluate: Evaluate, *,
-            default: Floats, noise: float, finer: Evaluate | None = None) -> Examination:
+            default: Floats, noise: float, finer: Evaluate | None = None,
+            longer: Evaluate | None = None) -> Examination:
     """
     Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
 
@@ -80,6 +81,8 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     :param default: (d,) the default parameters.
     :param noise: see `Examination`.
     :param finer: simulates with more nodes and a smaller step; None: not examined.
+    :param longer: simulates a DLO that is longer by the standard deviation of
+        its measured length; None: not examined.
     """
     count = 0
 
@@ -116,7 +119,12 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
         count += 1
         fine, = finer(point[None, :])
         shift = np.ones(dimension) if fine is None else optimum_shift(residuals, fine, jacobian)
-    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift)
+    length = None
+    if longer is not None:
+        count += 1
+        stretched, = longer(point[None, :])
+        length = None if stretched is None else stretched - residuals
+    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift, length=length)
     assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,

@@ -16,10 +16,11 @@
 Uncertainty: what a calibration does not know, in the unit cube of its parameters.
 
 Where the search ended in a regular minimum, the covariance follows from the
-Jacobian of the residuals there.  Three things are added to what a textbook's
+Jacobian of the residuals there.  Four things are added to what a textbook's
 formula says, because alone it is several times too small for real DLOs:
 
 - neighbouring points err alike, so that they count as fewer;
+- the initial chain of each trial is measured, too, and with it the length of the DLO;
 - where the model cannot explain the residuals, the trials disagree with each
   other, and how far says more than how many points there are;
 - the step and the nodes of the simulation move the optimum.
@@ -48,7 +49,7 @@ AT_BOUND = 0.002
 MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
 FEWEST_TRIALS = 3  # whose disagreement says something
 SMALLEST_RESIDUAL = 1e-9  # m; of a model that explains everything
-REMAINING = 2.0  # times what a simulation twice as fine changes is what is missing, of an error of first order
+REMAINING = 2.0  # times the change by a simulation twice as fine is missing: the error is of first order
 INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
 ROBUST = 1.5  # deviations beyond which a residual counts less (Huber, Robust Statistics, 1981, 4.5)
 CAPPED = 0.7785  # mean square of a standard normal value that is cut off there
@@ -160,7 +161,8 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
 
 
 def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], *,
-                  noise: float = float('nan'), shift: Floats | None = None) -> Uncertainty:
+                  noise: float = float('nan'), shift: Floats | None = None,
+                  length: Floats | None = None) -> Uncertainty:
     """
     Return what the residuals and their derivatives at a minimum say.
 
@@ -170,6 +172,8 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
     :param shapes: (goals, points) of each trial.
     :param noise: standard deviation of one coordinate of the observations [m]; nan where not known.
     :param shift: (d,) how far a finer simulation moves the optimum; None: not known.
+    :param length: (m,) [m] how one standard deviation of each trial's measured length changes its
+        residuals; None: not known.
     """
     weights = _weights(residuals)
     right, matrix = weights * residuals, weights[:, None] * jacobian
@@ -188,6 +192,10 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (REMAINING * shift)**2
+    if length is not None:  # each trial's own error of length moves the optimum by a Gauss-Newton step
+        pulls = [matrix[rows].T @ (weights * length)[rows] for rows in _rows(shapes)]
+        moves = covariance @ np.array(pulls).T / scale**2
+        covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
     # None is known worse than a value that may be anything.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
@@ -214,13 +222,17 @@ def left_out(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, in
     if prior is None:
         prior = np.eye(len(information)) * max(1e-9 * float(np.trace(information)), 1e-30)
     gradient = jacobian.T @ residuals
-    moved, at = [], 0
-    for goals, points in shapes:
-        rows = slice(at, at + 3 * goals * points)
-        at = rows.stop
+    moved = []
+    for rows in _rows(shapes):
         rest = information - jacobian[rows].T @ jacobian[rows] + prior
         moved.append(-np.linalg.solve(rest, gradient - jacobian[rows].T @ residuals[rows]))
     return np.array(moved)
+
+
+def _rows(shapes: Sequence[tuple[int, int]]) -> list[slice]:
+    """Return where each trial's residuals are."""
+    ends = np.cumsum([0, *(3 * goals * points for goals, points in shapes)])
+    return [slice(int(begin), int(end)) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
