@@ -31,9 +31,12 @@ from dlo_calibration.calibration import advised, calibrate, CalibrationResult, c
 from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
+
+GUESSED = 'no trial tells anything about it; guessed from the height at which the DLO lies'
 
 SimulatorFactory = Callable[[Options], Simulator]
 
@@ -88,8 +91,9 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         notices.append(text)
         on_notice(text)
 
-    space = options.space
-    search = SEARCHES[options.search](space.dimension, options.seed, hints(trials, options))
+    known = hints(trials, options)
+    space, guessed = _guessed(options.space, known)
+    search = SEARCHES[options.search](space.dimension, options.seed, known)
     with ExitStack() as stack:
         executor = _executor(options, notice, on_notice)  # its processes start while the engine is made
         if executor is not None:
@@ -100,7 +104,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         result = calibrate(
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
-        result = advised(result, simulator, should_stop)
+        result = _noted(advised(result, simulator, should_stop), guessed)
     told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     result = replace(result, warnings=(*result.warnings, *told))
     return confirmed_with(result, options, make_simulator, should_stop)
@@ -113,6 +117,32 @@ def hints(trials: Sequence[Trial], options: Options) -> Hints:
     known = priors(trials, options.space, options.table_height if options.table else None)
     rows = tuple(int(count) for count in known.rows)
     return Hints(known.start, known.lower, known.upper, rows, known.excites)
+
+
+def _guessed(space: ParameterSpace, known: Hints) -> tuple[ParameterSpace, tuple[str, ...]]:
+    """
+    Return a space whose defaults are what the chains alone say, and of which parameters.
+
+    That is the self-collision radius only, from the height at which the DLO lies: no
+    other has a guess where no trial shows it.
+    """
+    name = 'self_collision'
+    if name not in space.free or space.fixed.get(name, BY_NAME[name].default) != BY_NAME[name].default:
+        return space, ()
+    start = float(known.start[space.free.index(name)])
+    if not 0 <= start <= 1:
+        return space, ()
+    return replace(space, fixed={**space.fixed, name: start * SCALE}), (name,)
+
+
+def _noted(result: CalibrationResult, guessed: Sequence[str]) -> CalibrationResult:
+    """Return a result that says where a value is a guess from the chains alone."""
+    excited = None if result.examination is None else result.examination.uncertainty.excited
+    parameters = dict(result.parameters)
+    for k, name in enumerate(result.space.free):
+        if name in guessed and excited is not None and not excited[k]:
+            parameters[name] = replace(parameters[name], note=GUESSED)
+    return replace(result, parameters=parameters)
 
 
 def confirmed_with(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
