@@ -44,6 +44,7 @@ Numbers = tuple[float, ...]
 UP = np.array([0.0, 0.0, 1.0])
 APART, TOGETHER = 'apart', 'together'
 MOVING = ('both', 'first', 'second')
+NO_TIME = 1e-9  # s: what is nearer is not gone to, for after MOST seconds a float cannot tell less
 LEAST, MOST = 1e-9, 1e6  # of what follows, and of a start: beyond, it is no hand of a robot
 POSITIVE = ('speed', 'height', 'distance')
 
@@ -104,7 +105,7 @@ class NamedAction:
         """Return a hand that goes through (3,) points [m] at a speed, leaving out those where it is."""
         way = [points[0]]
         for point in points[1:]:
-            if np.linalg.norm(point - way[-1]) > 0:
+            if np.linalg.norm(point - way[-1]) > NO_TIME * speed:
                 way.append(point)
         steps = np.linalg.norm(np.diff(way, axis=0), axis=1) / speed
         return Hand(name, (grip,), self.start + np.concatenate([[0.0], np.cumsum(steps)]), np.array(way))

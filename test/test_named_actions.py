@@ -18,7 +18,7 @@
 
 import inspect
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -175,10 +175,13 @@ def test_what_cannot_be_done_is_refused(make, match):
 
 @given(point=st.integers(-6, 5), to=st.tuples(*[st.floats(-10, 10)] * 3), speed=st.floats(1e-3, 10),
        height=st.floats(1e-3, 1), start=st.floats(0, 1e3))
+@example(point=0, to=(0.0, 1.3e-114, 0.0), speed=1.0, height=0.1, start=0.0)
+@example(point=0, to=(0.0, 1e-8, 0.0), speed=1.0, height=0.1, start=1e6)
 def test_any_place_is_reached_at_constant_speed(point, to, speed, height, start):
     hand = only_hand(GraspAndPlace(point=point, to=to, speed=speed, height=height, start=start))
-    np.testing.assert_array_equal(hand.positions[-1], to)
+    np.testing.assert_allclose(hand.positions[-1], to, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(hand.positions[0], CHAIN.points[point])
+    assert (np.diff(hand.times) > 0).all()
     assert hand.positions[:, 2].max() == pytest.approx(max(to[2], 0) + height)
     length = np.linalg.norm(np.diff(hand.positions, axis=0), axis=1).sum()
     assert hand.end - hand.start == pytest.approx(length / speed, abs=1e-9)
