@@ -27,6 +27,7 @@ import subprocess
 import sys
 import time
 
+from processes import children
 import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
@@ -258,28 +259,33 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 
 
 PROGRAM = """
-import sys
+import pathlib, sys
 from toy_simulator import ToySimulator
-from dlo_calibration import cli
+from dlo_calibration import cli, terminal
 
-if __name__ == '__main__':
-    sys.exit(cli.main(sys.argv[2:], lambda options: ToySimulator(float(sys.argv[1]))))
+class Bar(terminal.SearchBar):
+    def take(self, evaluation):
+        super().take(evaluation)
+        pathlib.Path(sys.argv[2]).touch()
+
+terminal.SearchBar = Bar
+sys.exit(cli.main(sys.argv[3:], lambda options: ToySimulator(float(sys.argv[1]))))
 """
 
 
 @pytest.mark.parametrize(('workers', 'seconds', 'code'), [(1, 0.01, 0), (2, 0.01, 0), (2, 600.0, 130)])
 def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, seconds, code):
+    evaluated = tmp_path / 'evaluated'
     process = subprocess.Popen(
-        [sys.executable, '-c', PROGRAM, str(seconds), 'fit', str(session), '--json',
-         '--search', 'random', '--evaluations', '5000', '--workers', str(workers),
+        [sys.executable, '-c', PROGRAM, str(seconds), str(evaluated), 'fit', str(session), '--json',
+         '--search', 'random', '--evaluations', '100000', '--workers', str(workers),
          '--output', str(tmp_path / 'out')],
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()
-    while not (tmp_path / 'out' / 'report.html').exists():  # claimed before the search begins
-        assert time.monotonic() - begun < PATIENCE
+    while not evaluated.exists() if code == 0 else len(children(process.pid)) < workers:
+        assert time.monotonic() - begun < PATIENCE and process.poll() is None
         time.sleep(0.01)
-    time.sleep(2.0)
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == code, errors
