@@ -17,15 +17,21 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
+from functools import partial
 import logging
+import pickle
 import socket
 import threading
+import time
 from typing import Any, Callable, Mapping
 import warnings
 
 from dlo_calibration.errors import DloCalibrationError, InputError
 
 PATIENCE = 8  # s until a scheduler counts as unreachable
+RETURN = 30.0  # s that a lost worker, or another one, has to come back where it was the last one
+LOOK = 0.5  # s between two looks at the connection
+LEAVING = 2.0  # s that the end waits for a scheduler to hear of it
 LOGGERS = ('distributed', 'distributed.client', 'tornado.application', 'asyncio')  # of Dask, on stderr
 PACKAGE = __name__.partition('.')[0]
 
@@ -34,7 +40,7 @@ class ClusterExecutor(Executor):
     """
     An executor of the workers that a Dask scheduler has.
 
-    The machine of the scheduler needs this package as those of its workers do.
+    The workers' machines need this package; that of the scheduler needs Dask alone.
 
     :param address: of the scheduler, e.g. ``tcp://host:8786``.
     :param on_loss: called with a sentence for each worker that is lost, from any thread.
@@ -54,6 +60,9 @@ class ClusterExecutor(Executor):
         self._address = address
         self._on_loss = on_loss
         self._closed = threading.Event()
+        self._pending: dict[Future[Any], Future[Any]] = {}  # what has no outcome yet -> Dask's
+        self._given_up: BaseException | None = None
+        self._deadline = float('inf')  # for a worker to be there
         self._silence = _Silence()
         try:
             # A client that cannot connect tries for long, and complains once more when it is collected.
@@ -69,16 +78,22 @@ class ClusterExecutor(Executor):
         # Without pure=False, Dask would take equal calls of two calibrations for the same one.
         self._executor = self._client.get_executor(pure=False)
         self._client.subscribe_topic('all', self._hear)
-        if not self._client.scheduler_info()['workers']:
+        if not self._client.nthreads():
             on_wait(f'the scheduler {address} has no workers yet; waiting for one '
                     f'(start it with: dask worker {address} --nthreads 1)')
+        threading.Thread(target=self._watch, name='watching a scheduler', daemon=True).start()
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
         """Return a future that may be cancelled at any time."""
         future: Future[Any] = Future()
-        there = self._executor.submit(call, *args, **keywords)
+        # Only bytes and a function of Python go to Dask: a worker that cannot read them, as it lacks a
+        # module, would leave the scheduler without a word, and the scheduler itself need not read them.
+        there = self._executor.submit(pickle.loads, pickle.dumps(_Call(call, args, keywords)))
+        self._pending[future] = there
         future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
-        there.add_done_callback(lambda done: self._pass_on(done, future))
+        there.add_done_callback(lambda _: self._pass_on(future))
+        if self._given_up is not None:
+            self._fail(future, self._given_up)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -92,6 +107,11 @@ class ClusterExecutor(Executor):
         if self._closed.is_set():
             return
         self._closed.set()
+        leaving = threading.Thread(target=self._leave, name='leaving a scheduler', daemon=True)
+        leaving.start()
+        leaving.join(LEAVING)  # one that is gone, or does not answer, must not hold anybody up
+
+    def _leave(self) -> None:
         try:
             self._executor.shutdown(wait=False)
             self._client.close(timeout=PATIENCE)
@@ -100,17 +120,24 @@ class ClusterExecutor(Executor):
         finally:
             self._silence.end()
 
-    def _pass_on(self, done: Future[Any], future: Future[Any]) -> None:
-        """Give `future` what `done` ended with, in words that say what to do."""
-        if not future.set_running_or_notify_cancel():
+    def _pass_on(self, future: Future[Any]) -> None:
+        """Give a future what it ended with, in words that say what to do."""
+        done = self._pending.get(future)
+        if done is None:
             return
         error = CancelledError() if done.cancelled() else done.exception()
-        if error is None:
+        if error is not None:
+            reason = CancelledError() if self._closed.is_set() else self._explained(error)
+            self._fail(future, reason)
+            if reason is not error and not self._closed.is_set():
+                self._give_up(reason)  # others might wait for ever, e.g. for workers that were all killed
+        elif self._pending.pop(future, None) and future.set_running_or_notify_cancel():
             future.set_result(done.result())
-        elif self._closed.is_set():
-            future.set_exception(CancelledError())
-        else:
-            future.set_exception(self._explained(error))
+
+    def _fail(self, future: Future[Any], error: BaseException) -> None:
+        """End a future, unless it has ended."""
+        if self._pending.pop(future, None) and future.set_running_or_notify_cancel():
+            future.set_exception(error)
 
     def _explained(self, error: BaseException) -> BaseException:
         from distributed import KilledWorker
@@ -124,17 +151,58 @@ class ClusterExecutor(Executor):
         if missing:
             return InputError(f'scheduler {self._address}', f'a machine without the module {missing}',
                               f'{PACKAGE} and its engine, the same version everywhere',
-                              f'install {PACKAGE} there, and start it again')
+                              f'install {PACKAGE} there, and start the worker again')
+        if isinstance(error, AttributeError) and str(error).startswith("Can't get attribute"):  # by pickle
+            return InputError(f'scheduler {self._address}', f'a machine with other programs ({error})',
+                              f'{PACKAGE} and its engine, the same version everywhere',
+                              f'install this {PACKAGE} there, and start the worker again')
         if isinstance(error, CancelledError) or type(error).__name__ == 'FutureCancelledError':
-            return DloCalibrationError(f'the scheduler {self._address} is lost, or dropped the evaluations; '
-                                       'see its log, and start again')
+            return self._lost()
         return error
+
+    def _lost(self) -> DloCalibrationError:
+        return DloCalibrationError(f'the scheduler {self._address} is lost, or dropped the evaluations; '
+                                   'see its log, and start again')
 
     def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
         """Take an event of the scheduler."""
         _, content = event
         if content.get('action') == 'remove-worker' and not self._closed.is_set():
             self._on_loss(f'the scheduler lost the worker {content.get("worker")}; what it did is done again')
+            self._deadline = time.monotonic() + RETURN
+
+    def _watch(self) -> None:
+        """Give up where the scheduler or its last worker is lost; the work of a thread."""
+        while not self._closed.wait(LOOK):
+            if self._client.status != 'running':  # Dask has forgotten everything, and tries to connect again
+                return self._give_up(self._lost())
+            if time.monotonic() > self._deadline:
+                self._deadline = float('inf')
+                try:
+                    workers = self._client.nthreads()
+                except Exception as error:  # it is being lost, which the next look tells
+                    logging.getLogger(__name__).debug('asking a scheduler for its workers: %r', error)
+                    continue
+                if not workers:
+                    return self._give_up(DloCalibrationError(
+                        f'the scheduler {self._address} lost its last worker, and none came back within '
+                        f'{RETURN:g} s; see their logs, give them more memory, and start them again'))
+
+    def _give_up(self, reason: BaseException) -> None:
+        """End everything that was submitted, and what will be."""
+        self._given_up = reason
+        for future in list(self._pending):
+            self._fail(future, reason)
+
+
+class _Call:
+    """A call that is made where it is unpickled."""
+
+    def __init__(self, call: Callable[..., Any], args: tuple[Any, ...], keywords: Mapping[str, Any]) -> None:
+        self._made = partial(call, **keywords), args
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return self._made
 
 
 def _missing_module(error: BaseException | None) -> str:

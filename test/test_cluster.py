@@ -27,7 +27,7 @@ import time
 
 import pytest
 from toy_messages import toy_trials
-from toy_simulator import ToySimulator
+from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cluster, DloCalibrationError, InputError
 from dlo_calibration.config import Options
@@ -48,10 +48,10 @@ def dask(part, *words, **environment):
 
 
 @contextmanager
-def running(folder, workers=2):
-    """Give the address of a scheduler, and the processes: its own and the workers'."""
+def running(folder, workers=2, **environment):
+    """Give the address of a scheduler that has Dask alone, and the processes: its own and the workers'."""
     file = folder / 'scheduler.json'
-    scheduler = dask('scheduler', '--port', '0', '--scheduler-file', str(file))
+    scheduler = dask('scheduler', '--port', '0', '--scheduler-file', str(file), PYTHONPATH='', **environment)
     processes = [scheduler]
     try:
         begun = time.monotonic()
@@ -132,6 +132,70 @@ def test_without_workers_it_says_so_and_waits(tmp_path):
         calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator(), None,
                        lambda: bool(told), told.append)
     assert 'has no workers yet' in told[0]
+
+
+def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(tmp_path):
+    (tmp_path / 'toy_simulator.py').touch()
+    with running(tmp_path, 0) as (address, processes):
+        for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
+                            (tmp_path, "other programs .*'ToySimulator'.* the same version everywhere")):
+            worker = dask('worker', address, '--no-nanny', '--nthreads', '1',
+                          PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
+            processes.append(worker)
+            with pytest.raises(InputError, match=words):
+                calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator())
+            worker.kill()
+            worker.wait()
+
+
+def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_do(tmp_path):
+    with running(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES='0') as (address, _):
+        with pytest.raises(DloCalibrationError, match='1 workers of the scheduler .* give them more memory'):
+            calibrate_with(toy_trials(1), options(address), lambda _: Deadly())
+
+
+def test_the_last_worker_has_a_while_to_come_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, 'RETURN', 1.0)
+    told = []
+    with running(tmp_path, 1) as (address, _):
+        wait_for_workers(address, 1)
+        with pytest.raises(DloCalibrationError, match='lost its last worker, and none came back within 1 s'):
+            calibrate_with(toy_trials(1), options(address), lambda _: Deadly(), on_notice=told.append)
+    assert len(told) == 1
+    assert 'the scheduler lost the worker' in told[0]
+
+
+def test_a_worker_that_comes_back_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, 'RETURN', PATIENCE)
+    with running(tmp_path, 1) as (address, processes):
+        def replace(evaluation):
+            if evaluation.index == 10:
+                processes[1].kill()
+                processes.append(dask('worker', address, '--no-nanny', '--nthreads', '1'))
+
+        torn = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(0.005), replace)
+    same(torn, calibrate_with(toy_trials(2), options(), lambda _: ToySimulator()))
+
+
+def test_a_scheduler_that_is_killed_ends_the_calibration(machines, capfd):
+    address, (scheduler, *_) = machines
+    with pytest.raises(DloCalibrationError, match=f'the scheduler {address} is lost'):
+        calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.01),
+                       lambda _: scheduler.kill())
+    assert capfd.readouterr() == ('', '')
+
+
+def test_a_scheduler_that_hangs_holds_nobody_up(machines):
+    address, (scheduler, *_) = machines
+    seen = []
+
+    def freeze(evaluation):
+        seen.append(evaluation)
+        scheduler.send_signal(signal.SIGSTOP)
+
+    result = calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.01),
+                            freeze, lambda: bool(seen))
+    assert result.stop_reason == 'stopped on request'
 
 
 @pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])

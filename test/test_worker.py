@@ -27,13 +27,12 @@ import numpy as np
 from processes import children
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import ToySimulator
+from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation, pool
 from dlo_calibration.config import ENGINES as ENGINE_NAMES
 from dlo_calibration.config import Options
 from dlo_calibration.engines import ENGINES
-from dlo_calibration.parameters import BY_NAME
 from dlo_calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -154,22 +153,6 @@ def test_killed_process_is_told_at_once_and_in_the_result_which_stays_the_same()
     assert result.parameters == alone.parameters
     assert result.best.residuals.tobytes() == alone.best.residuals.tobytes()
     assert [e.index for e in events if isinstance(e, Evaluation)] == list(range(150))
-
-
-class Deadly(ToySimulator):
-    """It kills its process at some points: always, or where a file does not exist yet."""
-
-    def __init__(self, file=None):
-        super().__init__()
-        self.file = file
-
-    def simulate(self, trial, physical):
-        if BY_NAME['flexibility'].value(physical['flexibility']) > 90 and (
-                self.file is None or not self.file.exists()):
-            if self.file is not None:
-                self.file.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().simulate(trial, physical)
 
 
 def test_an_evaluation_whose_process_dies_is_repeated(tmp_path):

@@ -17,6 +17,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+import signal
 import time
 from typing import Mapping, Sequence
 
@@ -65,6 +68,27 @@ class ToySimulator:
 
     def close(self) -> None:
         """Hold nothing."""
+
+
+class Deadly(ToySimulator):
+    """
+    It kills its process where flexibility is more than 90 (0..100).
+
+    :param file: once it exists, nothing is killed any more; the first death makes it.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        super().__init__()
+        self.file = file
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """Die, or do what the toy does."""
+        if BY_NAME['flexibility'].value(physical['flexibility']) > 90 and (
+                self.file is None or not self.file.exists()):
+            if self.file is not None:
+                self.file.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().simulate(trial, physical)
 
 
 def toy_goal(points: Floats, hands: Sequence[Hand], physical: Mapping[str, float]) -> Floats:
