@@ -98,7 +98,7 @@ def test_everything_else_comes_back(file, result):
     assert (found.score, found.scores, found.errors) == (result.best.score, result.best.scores, result.errors)
     assert (found.search, found.engine, found.seed) == ('random', 'toy', 1)
     assert (found.evaluations, found.simulations, found.stop_reason, found.seconds) == (
-        20, 40, result.stop_reason, result.seconds)
+        20, result.simulations, result.stop_reason, result.seconds)
     assert (found.trials, found.warnings) == (('trial 1', 'trial 2'), result.warnings)
     np.testing.assert_array_equal(found.chain.points, result.trials[0].initial.points)
     assert found.chain.hands is None and not found.chain.features.any()

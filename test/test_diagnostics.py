@@ -59,7 +59,7 @@ def test_result_tells_every_parameter_exactly(types):
     for name, estimate in found.parameters.items():
         assert list(values[name]) == [
             'value', 'std', 'lower', 'upper', 'unit', 'physical_value', 'physical_lower', 'physical_upper',
-            'physical_unit', 'identifiable']
+            'physical_unit', 'identifiable', 'verdict', 'note']
         for key, value in values[name].items():
             assert value == ('0..100' if key == 'unit' else getattr(estimate, key))
     levels = {name: one.level for name, (one, _) in by_name(message).items()}
@@ -78,7 +78,8 @@ def test_result_tells_the_whole(types):
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent',
-        'warnings': 'one; two'}
+        'warnings': 'one; two', 'undetermined': '', 'cross_validated_error_mm': '', 'default_error_mm': '',
+        'noise_mm': '', 'residual_std_mm': '', 'findings': 'not identifiable from these trials: friction'}
     assert one.level == types.level(1)
     clean = found_result(warnings=(), seed=None)
     one, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']
