@@ -21,6 +21,7 @@ One that dies is replaced, and what it was doing is done again.
 
 from __future__ import annotations
 
+import atexit
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -68,6 +69,8 @@ class ProcessExecutor(Executor):
         self._closed = threading.Event()
         self._processes: dict[_Process, connection.Connection] = {}
         self._changing = threading.Lock()  # of the processes
+        # Python would wait for ever for processes that ignore the SIGTERM it sends them at its end.
+        atexit.register(self.close)
         first = []
         try:
             for _ in range(workers or cores()):
@@ -97,10 +100,12 @@ class ProcessExecutor(Executor):
         if wait:
             for thread in self._threads:
                 thread.join()
+            atexit.unregister(self.close)
 
     def close(self) -> None:
         """End the processes now, whatever they are doing."""
         self._closed.set()
+        atexit.unregister(self.close)
         self._cancel_waiting()
         self._kill()
         self.shutdown()

@@ -231,6 +231,12 @@ def test_processes_do_not_import_the_main_module_and_end_with_a_killed_parent(pa
     assert gone(children)
 
 
+def test_a_program_that_ends_without_closing_does_not_wait_for_its_processes():
+    program = PROGRAM.replace('time.sleep(600)\n', '')
+    subprocess.run([sys.executable, '-c', program], cwd=ROOT, stdout=subprocess.DEVNULL, check=True,
+                   timeout=PATIENCE)
+
+
 def test_processes_leave_signals_to_their_parent(parent):
     parent.stdout.readline()
     children = spawned(parent.pid, 2)
