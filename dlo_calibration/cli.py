@@ -215,11 +215,17 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         folder = Path(found.options.output_directory)
     if folder is not None:
         _make_folder(folder, _files(chosen.session))
+    told: list[str] = []
+
+    def tell(text: str) -> None:
+        if text not in told:
+            _note(f'warning: {text}')
+            told.append(text)
+
     with StopFlag() as stop:
         with SearchBar(found.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
             try:
-                result = calibrate_with(trials, found.options, make_simulator, bar.take, stop,
-                                        lambda text: _note(f'warning: {text}'))
+                result = calibrate_with(trials, found.options, make_simulator, bar.take, stop, tell)
             except SimulationError:
                 if not stop():
                     raise
@@ -229,7 +235,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                 _write(folder, chosen.session, found, result)
                 _note(f'{", ".join(_files(chosen.session))} are in {folder}')
         finally:  # a disk that is full by now must not lose what was found
-            _print_result(result, chosen.json)
+            _print_result(result, chosen.json, told)
     return 0
 
 
@@ -340,11 +346,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _print_result(result: CalibrationResult, as_json: bool) -> None:
+def _print_result(result: CalibrationResult, as_json: bool, told: Sequence[str] = ()) -> None:
     from dlo_calibration import terminal
 
     for warning in result.warnings:
-        _note(f'warning: {warning}')
+        if warning not in told:
+            _note(f'warning: {warning}')
     found = document(result)
     if as_json:
         _print_json(found, sys.stdout)

@@ -30,7 +30,7 @@ import time
 from processes import children
 import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
-from toy_simulator import ToySimulator
+from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli
 from dlo_calibration.config import declarations, Options
@@ -295,6 +295,29 @@ def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, 
     else:
         assert only_json(output)['stop_reason'] == 'stopped on request'
         assert read_session(tmp_path / 'out' / 'session.mcap').messages[0][0] == INITIAL
+
+
+def test_a_process_that_died_is_told_once(run, session, tmp_path):
+    code, output, errors = run('fit', session, '--json', '--search', 'random', '--evaluations', 60,
+                               '--workers', 2, toy=Deadly(tmp_path / 'died'))
+    assert code == 0
+    assert (tmp_path / 'died').exists()
+    assert sum('was killed by SIGKILL' in line for line in errors.splitlines()) == 1
+    warning, = only_json(output)['warnings']
+    assert 'was killed by SIGKILL' in warning
+
+
+def test_evaluations_that_were_abandoned_are_told_in_the_table_and_in_the_file(run, session, tmp_path):
+    code, output, _ = run('fit', session, '--search', 'random', '--evaluations', 100,
+                          '--output', tmp_path / 'out')
+    assert code == 0
+    with (tmp_path / 'out' / 'evaluations.csv').open(encoding='utf-8', newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    skipped = sum(int(row['skipped_trials']) for row in rows)
+    assert skipped > 0
+    assert all((row['skipped_trials'] == '0') == bool(row['mean_error_m']) for row in rows)
+    words = f'100 ({200 - skipped} simulations; {skipped} evaluations abandoned early)'
+    assert words in ' '.join(output.split())
 
 
 def test_module_is_the_command(session):

@@ -29,7 +29,7 @@ import time
 from processes import children
 import pytest
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
-from toy_simulator import ToySimulator
+from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli, InputError
 from dlo_calibration.config import declarations, Options
@@ -194,6 +194,18 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert written.values == {name: one['value'] for name, one in replayed['parameters'].items()}
     kinds = {record.name for record in read_session(folder).records}
     assert kinds == {*INPUT_TYPES, *OUTPUT_TYPES}
+
+
+def test_a_process_that_died_is_told_in_log_status_and_result(start_node, tmp_path):
+    robot = start_node(Deadly(tmp_path / 'died'), workers=2, evaluations=60, search='random')
+    robot.send(session_messages(TYPES, 2))
+    robot.until_status(trials='2')
+    assert robot.call('start').success
+    result = robot.until_result()
+    assert 'was killed by SIGKILL' in whole(result)['warnings']
+    for topic in (robot.heard['log'], [one.status[0] for one in robot.heard['status']]):
+        texts = [getattr(one, 'msg', '') or getattr(one, 'message', '') for one in topic]
+        assert any('was killed by SIGKILL' in text for text in texts), texts
 
 
 def test_what_comes_after_the_start_is_for_the_next_one(start_node, tmp_path, capsys):

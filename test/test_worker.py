@@ -173,12 +173,22 @@ def test_an_evaluation_that_kills_every_process_ends_the_calibration():
     assert len(told) >= 3
 
 
+class Compiling(ToySimulator):
+    """It simulates only where it was prepared before it was copied."""
+
+    ready = False
+
+    def prepare(self):
+        self.ready = True
+
+    def simulate(self, trial, physical):
+        assert self.ready, 'a copy was made before prepare'
+        return super().simulate(trial, physical)
+
+
 def test_the_simulator_is_prepared_before_any_copy_is_made():
-    ready = []
-    simulator = ToySimulator()
-    simulator.prepare = lambda: (ready.append(1), delattr(simulator, 'prepare'))
-    calibrate_with(toy_trials(1), options(workers=2, evaluations=4), lambda _: simulator)
-    assert ready == [1]
+    result = calibrate_with(toy_trials(1), options(workers=2, evaluations=4), lambda _: Compiling())
+    assert len(result.evaluations) == 4
 
 
 def spawned(parent, count):
