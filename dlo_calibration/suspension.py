@@ -21,7 +21,6 @@ import math
 from typing import Iterator, Sequence
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from dlo_calibration.chain import bezier_curve, Floats
 
@@ -152,6 +151,8 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
 def _fitted(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
             noise: float) -> Balance | None:
     """Return the balance of a part in windows; what is known of its last end is not used."""
+    from scipy.integrate import trapezoid  # half a second to load, which most commands need not spend
+
     system = _System(along, first, pins, windows)
     freedom = sum(len(own) for own, _ in system.rows) * 3 - system.count
     if freedom < FEWEST_ROWS:
@@ -221,6 +222,8 @@ class _System:
 
         :returns: for each window (f, 3, u) positions; (F, 3, u) internal force over EI.
         """
+        from scipy.integrate import cumulative_trapezoid
+
         force = np.zeros((len(self.fine), 3, self.count))
         force[:, :, 0] = self.fine[:, None] * UP
         for k, pin in enumerate(self._forces):
