@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from typing import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.action import Action
 from dlo_calibration.chain import Chain, Floats
@@ -122,23 +123,28 @@ def expected_std(trial: Trial, space: ParameterSpace, simulator: Simulator, poin
 
 
 def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats, std: Floats,
-                length: float) -> Floats:
+                length: float, *, shown: NDArray[np.bool_] | None = None, at_rest: bool = True) -> Floats:
     """
     Return (m, d) [m per unit cube]: how the simulated chains of a trial change with the parameters.
 
     Central differences as wide as each parameter is unknown, because the chains need not be linear over
     that.
 
-    :raises SimulationError: where a rollout diverges or does not come to rest.
+    :param shown: (d,) False for parameters that are not simulated, as they change nothing; None: all are.
+    :param at_rest: refuse rollouts that do not come to rest; else they count as they are at the limit.
+    :raises SimulationError: where a rollout diverges, or does not come to rest.
     """
-    columns = []
+    columns: list[Floats] = []
     for k, step in enumerate(np.clip(std, SMALLEST_STEP, LARGEST_STEP)):
+        if shown is not None and not shown[k]:
+            columns.append(np.zeros(3 * len(trial.goals) * len(trial.initial)))
+            continue
         chains, values = [], []
         for sign in (-1, 1):
             beside = point.copy()
             beside[k] = min(max(point[k] + sign * step, 0.0), 1.0)
             rollout = simulator.simulate(trial, space.physical(space.values(beside), length))
-            if not all(rollout.settled):
+            if at_rest and not all(rollout.settled):
                 raise SimulationError(f'trial {trial.name!r} does not come to rest')
             chains.append(rollout.chains.ravel())
             values.append(beside[k])

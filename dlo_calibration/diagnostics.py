@@ -22,6 +22,7 @@ from typing import Any, Mapping, Sequence
 from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.confirmation import Confirmation
+from dlo_calibration.gain import Gain
 from dlo_calibration.messages import MessageTypes
 from dlo_calibration.parameters import measured
 
@@ -128,7 +129,7 @@ def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
 
 
 def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '') -> Any:
+           incomplete: str = '', detail: str = '', gain: Gain | None = None) -> Any:
     """
     Build the message about what the node is doing.
 
@@ -137,14 +138,18 @@ def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_ref
     :param last_refusal: text of the last refusal; empty where there was none.
     :param incomplete: what the newest trial lacks; empty where nothing.
     :param detail: of the state, e.g. why it failed.
+    :param gain: what the newest trial tells, once it is known.
     """
     if state not in STATES:
         raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
     message = f'{state}: {detail}' if detail else state
+    last_trial = '' if gain is None else gain.words
+    if last_trial and state == 'collecting':
+        message += f'; {last_trial}'
     return _diagnostics(types, stamp, [_status(
         types, ERROR if state == 'failed' else OK, 'status', message,
         {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
-         'detail': detail})])
+         'detail': detail, 'last_trial': last_trial, **({} if gain is None else gain.values)})])
 
 
 def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:

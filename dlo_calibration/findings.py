@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.gain import silent
 from dlo_calibration.parameters import SCALE
 from dlo_calibration.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 
@@ -30,7 +31,7 @@ MEAN_DISTANCE = float(np.sqrt(8 / np.pi))  # of white noise in three coordinates
 
 def sentences(result: CalibrationResult) -> list[str]:
     """Return what the trials could not tell, what would tell it, and how far to trust the fit."""
-    return [*_verdicts(result), *_open(result), *_advice(result), *_check(result)]
+    return [*_verdicts(result), *_open(result), *_silent(result), *_advice(result), *_check(result)]
 
 
 def values(result: CalibrationResult) -> dict[str, Any]:
@@ -73,6 +74,11 @@ def _verdicts(result: CalibrationResult) -> list[str]:
 
 def _open(result: CalibrationResult) -> list[str]:
     return [f'the trials leave open: {words}' for words in result.undetermined]
+
+
+def _silent(result: CalibrationResult) -> list[str]:
+    names = silent(result) if len(result.trials) > 1 else ()
+    return [f'{", ".join(names)} told nothing: all of it would have been known without'] if names else []
 
 
 def _advice(result: CalibrationResult) -> list[str]:

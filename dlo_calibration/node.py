@@ -47,6 +47,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from dlo_calibration import diagnostics, messages
+from dlo_calibration.appraiser import Appraiser
 from dlo_calibration.calibration import CalibrationResult, Evaluation
 from dlo_calibration.collector import KEPT, TrialCollector
 from dlo_calibration.config import Options
@@ -54,6 +55,7 @@ from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.gain import Gain
 from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.options_node import OptionsNode
@@ -85,6 +87,7 @@ TICK = 0.05  # s between two looks at the worker
 PROGRESS_PERIOD = 0.1  # s between two progress messages, at least
 MARKERS_PERIOD = 1.0  # s between two messages of markers while trials come in, at least
 MARKERS_SHARE = 0.1  # s more of it per trial, so that a long session is not recorded again and again
+STREAM_PERIOD = 2.0  # s between two looks at what trials tell, while messages keep coming
 QUIET = 0.5  # s without action or goal chain, until a last trial counts as complete for start_after_trials
 WAIT = 'wait for it, or call ~/stop first'
 DEFECT = 'this is a defect of dlo_calibration, please report it'
@@ -155,6 +158,7 @@ class CalibratorNode(OptionsNode):
         self._collected_with = self.options()
         self._make_simulator = make_simulator
         self._worker = Worker(make_simulator)
+        self._appraiser = Appraiser(make_simulator)
         self._recorder = Recorder(self._fail_to_record)
         self._calibrating: Options | None = None  # options of the calibration under way
         self._progress = Progress(0, 0)
@@ -182,8 +186,9 @@ class CalibratorNode(OptionsNode):
         self._closed = True
         LOG.removeHandler(self._notices)
         self._worker.stop()
+        self._appraiser.stop()
         try:
-            if not self._worker.join(PATIENCE):
+            if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
                 self._warn('the simulation under way does not end; it is left behind')
             self._take_events()
         except (InvalidHandle, RuntimeError) as error:  # the context was shut down by somebody else
@@ -239,7 +244,7 @@ class CalibratorNode(OptionsNode):
         self._record(kind, INPUT_TYPES[kind], octets)
         if kind != INITIAL:
             self._last_heard = time.monotonic()
-            self._unseen = True
+            self._unseen = self._unappraised = True
         try:
             try:
                 message = deserialize_message(octets, INPUTS[kind][0])
@@ -295,6 +300,8 @@ class CalibratorNode(OptionsNode):
         self._started_by_itself = True  # whoever starts it, it need not start by itself any more
         self._calibrating, self._progress = options, Progress(options.evaluations, len(trials))
         self._state, self._detail = 'calibrating', ''
+        self._appraiser.stop()
+        self._unappraised = True  # what a calibration without a result leaves open
         self._worker.start(trials, options)
         return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
 
@@ -308,6 +315,7 @@ class CalibratorNode(OptionsNode):
         if self._calibrating is not None:
             raise InputError('~/reset', 'a calibration under way', 'none', WAIT)
         self._recorder.end()
+        self._appraiser.stop()
         self._collected_with = self.options()
         self._collector = TrialCollector(self._collected_with)
         self._forget()
@@ -323,6 +331,8 @@ class CalibratorNode(OptionsNode):
         self._reported: dict[str, Any] = {}
         self._found: CalibrationResult | None = None
         self._unseen, self._seen = False, 0.0  # trials that the markers do not show yet; when they were sent
+        self._unappraised, self._appraised = False, 0.0  # as the two before, for what trials tell
+        self._gain: Gain | None = None  # of the newest trial that was appraised
 
     # The worker's events
 
@@ -331,6 +341,7 @@ class CalibratorNode(OptionsNode):
             self._hear_best_effort()
             self._take_events()
             self._start_by_itself()
+            self._appraise()
             self._show_new()
             self._report()
         except Exception as error:  # a callback that raises would end the node
@@ -401,13 +412,24 @@ class CalibratorNode(OptionsNode):
         self._show()
         self._report()
 
+    def _appraise(self) -> None:
+        """Take what trials turned out to tell; have new ones appraised, unless a calibration is under way."""
+        for gain in self._appraiser.waiting_gains():
+            self._gain = gain
+        now = time.monotonic()
+        quiet = now - self._last_heard > QUIET
+        if self._unappraised and self._calibrating is None and self._collector.count \
+                and not self._appraiser.alive and (quiet or now - self._appraised > STREAM_PERIOD):
+            self._unappraised, self._appraised = not quiet, now
+            self._appraiser.start(self._collector.trials, self.options(), self._found, whole=quiet)
+
     # Messages out
 
     def _report(self) -> None:
         """Send the status, where it differs from the last one."""
         content: dict[str, Any] = {
             'state': self._state, 'trials': self._collector.count, 'last_refusal': self._last_refusal,
-            'incomplete': self._collector.incomplete, 'detail': self._detail}
+            'incomplete': self._collector.incomplete, 'detail': self._detail, 'gain': self._gain}
         if content != self._reported:
             self._reported = content
             self._send('status', diagnostics.status(self._types, stamp=self._now(), **content))

@@ -31,7 +31,7 @@ ORDER = (
     'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
     'search', 'confirmation', 'uncertainty', 'examination', 'advice', 'calibration', '__init__', 'config',
-    'parameter_file', 'findings',
+    'parameter_file', 'gain', 'findings',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',
@@ -39,8 +39,8 @@ ORDER = (
     # engines
     'rollout', 'contact', 'natural', 'twist', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
-    'pool', 'cluster', 'worker', 'picture', 'animation', 'plot', 'terminal', 'report', 'signals', 'recorder',
-    'options_node', 'node',
+    'pool', 'cluster', 'worker', 'appraiser', 'picture', 'animation', 'plot', 'terminal', 'report',
+    'signals', 'recorder', 'options_node', 'node',
     'calibrator', 'cli', '__main__', 'demo',
 )
 

@@ -25,6 +25,7 @@ from dlo_calibration import diagnostics
 from dlo_calibration.action import Action, Hand
 from dlo_calibration.calibration import CalibrationResult, Evaluation, ParameterEstimate
 from dlo_calibration.chain import Chain
+from dlo_calibration.gain import Gain
 from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.score import PointErrors
 from dlo_calibration.trial import Goal, Trial
@@ -118,9 +119,26 @@ def test_status_tells_state_trials_and_refusal(types, state, level):
         types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why'
     ))['status']
     assert values == {'state': state, 'trials': '3', 'last_refusal': 'too few', 'incomplete': 'a goal',
-                      'detail': 'why'}
+                      'detail': 'why', 'last_trial': ''}
     assert one.message == f'{state}: why'
     assert one.level == types.level(level)
+
+
+def test_status_tells_what_the_newest_trial_tells(types):
+    gain = Gain('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
+    one, values = by_name(diagnostics.status(types, stamp=STAMP, state='collecting', trials=2, gain=gain))[
+        'status']
+    assert values['last_trial'] == gain.words
+    assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
+        'std_before_flexibility': 6.25, 'std_before_friction': 25.0,
+        'std_after_flexibility': 1.5625, 'std_after_friction': 25.0}
+    assert one.message == f'collecting; {gain.words}'
+    failed, values = by_name(diagnostics.status(
+        types, stamp=STAMP, state='failed', trials=2, detail='why',
+        gain=Gain.unknown('trial 2', ('friction',), 'it diverged')))['status']
+    assert values['last_trial'] == 'what trial 2 tells is not known: it diverged'
+    assert not any(key.startswith('std_') for key in values)
+    assert failed.message == 'failed: why'
 
 
 def test_status_knows_four_states(types):

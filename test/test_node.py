@@ -179,7 +179,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert whole(live)['seed'] == '7'
     robot.until(lambda: robot.heard['progress'])
     last = values(robot.heard['progress'][-1].status[0])
-    assert (last['evaluation'], last['evaluations']) == ('30', '30')
+    assert (last['evaluation'], last['evaluations']) == (whole(live)['evaluations'], '30')
     assert last['best_score'] == whole(live)['score']
     robot.calibrator.close()
 
@@ -243,6 +243,33 @@ def test_markers_show_trials_at_once_and_then_what_was_simulated(start_node):
     assert 'trial_3/simulated' not in shown[-1]
     robot.call('reset')
     robot.until(lambda: not any(shown[-1]), 'the trials are still shown')
+
+
+def test_status_says_whether_a_trial_added_information(start_node, tmp_path, capsys):
+    robot = start_node(seed=3)
+    robot.send(session_messages(TYPES, 1))
+    robot.until(lambda: robot.status.get('last_trial'), 'the first trial is not appraised')
+    assert robot.status['last_trial'].startswith('trial 1 tells flexibility (')
+    assert robot.heard['status'][-1].status[0].message.endswith(robot.status['last_trial'])
+    assert float(robot.status['std_after_flexibility']) < 0.5 * float(robot.status['std_before_flexibility'])
+    robot.send(trial_messages(TYPES, toy_trials(1)[0], 2 * MINUTE))  # the same again
+    robot.until(lambda: robot.status['last_trial'].startswith('trial 2'), 'the second trial is not appraised')
+    assert robot.status['last_trial'] == 'trial 2 adds nothing new: repeat it only to average noise'
+    robot.call('start')
+    live = robot.until_result()
+    folder, = folders(tmp_path)
+    assert repr(fitted(folder, capsys)['score']) == whole(live)['score']
+    assert robot.call('reset').success
+    robot.until_status(last_trial='', trials='0')
+
+
+def test_a_reset_while_a_trial_is_appraised_forgets_it(start_node):
+    robot = start_node(ToySimulator(1000.0))
+    robot.send(session_messages(TYPES, 1))
+    robot.until(lambda: robot.calibrator._appraiser.alive, 'nothing is appraised')
+    assert robot.call('reset').success
+    robot.until(lambda: not robot.calibrator._appraiser.alive, 'the appraisal does not end')
+    robot.until_status(last_trial='', trials='0')
 
 
 def test_late_listener_gets_result_and_status(start_node):

@@ -1,0 +1,129 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Trials are appraised beside whoever asks: in order, once each, and they end when told to."""
+
+from dataclasses import replace
+import os
+import time
+
+from processes import children
+import pytest
+from toy_messages import toy_trials, TRUTH
+from toy_simulator import ToySimulator
+
+from dlo_calibration.appraiser import Appraiser
+from dlo_calibration.config import Options
+from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.trial import Goal
+from dlo_calibration.worker import calibrate_with
+
+PATIENCE = 60.0
+OPTIONS = Options.of({'calibrate': ['flexibility', 'friction'], 'elasticity': TRUTH['elasticity'],
+                      'self_collision': TRUTH['self_collision'], 'evaluations': 40, 'workers': 1})
+TRIALS = toy_trials(3)
+
+
+def appraised(appraiser, trials, *rest, **more):
+    """Return the gains of one appraisal."""
+    appraiser.start(trials, OPTIONS, *rest, **more)
+    assert appraiser.join(PATIENCE)
+    return list(appraiser.waiting_gains())
+
+
+@pytest.fixture
+def appraiser():
+    found = Appraiser(lambda _: ToySimulator())
+    yield found
+    found.stop()
+    assert found.join(PATIENCE)
+
+
+def test_each_trial_is_appraised_once_after_those_before_it(appraiser):
+    first, second = appraised(appraiser, TRIALS[:2])
+    assert (first.trial, second.trial) == ('trial 1', 'trial 2')
+    assert first.told == ('flexibility', 'friction')
+    assert second.before.tolist() == first.after.tolist()
+    assert appraised(appraiser, TRIALS[:2]) == []
+    third, = appraised(appraiser, TRIALS)
+    assert third.trial == 'trial 3'
+    assert (third.before < first.before).all()
+
+
+def test_a_trial_that_changed_is_appraised_again(appraiser):
+    appraised(appraiser, TRIALS[:1])
+    later = replace(TRIALS[0], goals=(replace(TRIALS[0].goals[0], time=3.0),))
+    assert [gain.trial for gain in appraised(appraiser, [later])] == ['trial 1']
+    more = replace(later, goals=(*later.goals, replace(later.goals[0], time=4.0)))  # it still lies there
+    assert appraised(appraiser, [more]) == []
+
+
+def test_a_repeat_to_the_digit_is_a_trial_of_its_own(appraiser):
+    first, again = appraised(appraiser, [TRIALS[0], replace(TRIALS[0], name='trial 2')])
+    assert again.words == 'trial 2 adds nothing new: repeat it only to average noise'
+    assert (again.after < first.after).all()
+
+
+def test_what_is_forgotten_is_appraised_anew(appraiser):
+    appraised(appraiser, TRIALS[:1])
+    appraiser.stop()
+    assert [gain.trial for gain in appraised(appraiser, TRIALS[:1])] == ['trial 1']
+
+
+def test_a_trial_under_way_waits_until_it_has_a_goal_at_rest(appraiser):
+    chain = TRIALS[1].goals[0].chain
+    moving = replace(TRIALS[1], goals=(Goal(chain, 1.0, stable=False),))
+    assert [gain.trial for gain in appraised(appraiser, [TRIALS[0], moving], whole=False)] == ['trial 1']
+    assert [gain.trial for gain in appraised(appraiser, [TRIALS[0], moving])] == ['trial 2']
+
+
+def test_trials_of_a_result_are_not_appraised_and_later_ones_add_to_it(appraiser):
+    result = calibrate_with(TRIALS[:2], OPTIONS, lambda _: ToySimulator())
+    assert result.examination.regular
+    gain, = appraised(appraiser, TRIALS, result)
+    assert gain.trial == 'trial 3'
+    assert gain.before == pytest.approx(result.examination.uncertainty.std, rel=1e-3)
+
+
+@pytest.mark.parametrize(('toy', 'words'), [
+    (ToySimulator(fail_below=101.0), 'trial 1: diverged'),
+    (ToySimulator(crash=True), 'RuntimeError: the toy')])
+def test_a_trial_that_cannot_be_simulated_gives_a_sentence(toy, words):
+    gain, = appraised(Appraiser(lambda _: toy), TRIALS[:1])
+    assert gain.problem.startswith(words)
+    assert '\n' not in gain.words
+
+
+def test_an_engine_that_cannot_be_had_gives_a_sentence():
+    def refuse(options):
+        raise DloCalibrationError('no such engine')
+
+    gain, = appraised(Appraiser(refuse), TRIALS[:2])
+    assert gain.words == 'what trial 2 tells is not known: no such engine'
+
+
+def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
+    before = set(children(os.getpid()))
+    appraiser = Appraiser(lambda _: ToySimulator(seconds=1000.0))
+    appraiser.start(TRIALS, OPTIONS)
+    begun = time.monotonic()
+    while not set(children(os.getpid())) - before:
+        assert time.monotonic() - begun < PATIENCE
+        time.sleep(0.01)
+    with pytest.raises(DloCalibrationError, match='under way'):
+        appraiser.start(TRIALS, OPTIONS)
+    appraiser.stop()
+    assert appraiser.join(PATIENCE)
+    assert not any('spawn_main' in line for pid, line in children(os.getpid()).items() if pid not in before)
+    assert list(appraiser.waiting_gains()) == []

@@ -1,0 +1,191 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What one trial tells, against a simulator whose derivatives are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_simulator import REACH, toy_trial, ToySimulator
+
+from dlo_calibration import calibrate, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError
+from dlo_calibration.gain import covers, Gain, glimpse, information, knowledge, silent, told_by
+from dlo_calibration.search import SEARCHES
+from dlo_calibration.uncertainty import UNKNOWN_STD
+
+TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
+SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
+FIRST = toy_trial(TRUTH, 'trial 1')
+SQUARES = REACH**2 * np.sum(np.sin(np.linspace(0, np.pi, 11))**2)  # of the derivatives, for either parameter
+
+
+class Blind(ToySimulator):
+    """It shows friction in trials of one name only."""
+
+    def __init__(self, showing='trial 2'):
+        super().__init__()
+        self.showing = showing
+
+    def simulate(self, trial, physical):
+        shown = physical if trial.name == self.showing else {
+            **physical, 'friction': SPACE.physical({'flexibility': 0, 'friction': 70}, 1.0)['friction']}
+        return super().simulate(trial, shown)
+
+
+def gains(trials, simulator):
+    """Return what each trial adds to those before."""
+    known, found = knowledge(trials, SPACE, 0.0), []
+    for trial in trials:
+        after = known.after(information(trial, known, SPACE, simulator, 1.0, 0.0))
+        found.append(Gain(trial.name, known.names, known.std, after.std))
+        known = after
+    return found
+
+
+def test_before_any_trial_nothing_is_known():
+    known = knowledge([FIRST], SPACE, 0.0)
+    assert known.std == pytest.approx([UNKNOWN_STD] * 2)
+    assert ((known.point >= 0) & (known.point <= 1)).all()
+
+
+def test_the_standard_deviation_after_a_trial_is_that_of_linear_regression():
+    known = knowledge([FIRST], SPACE, 0.0)
+    after = known.after(information(FIRST, known, SPACE, ToySimulator(), 1.0, 0.0))
+    assert after.std == pytest.approx((12 + SQUARES / known.scale**2)**-0.5, rel=1e-6)
+
+
+def test_rougher_chains_tell_less():
+    smooth = toy_trial(TRUTH, n=41)
+    rough = smooth.goals[0].chain.points + np.random.default_rng(1).normal(0, 5e-3, (41, 3))
+    noisy = replace(smooth, goals=(Goal(Chain(rough), 2.0),))
+    assert knowledge([noisy], SPACE, 0.0).scale > 2 * knowledge([smooth], SPACE, 0.0).scale
+
+
+def test_a_trial_tells_what_it_shows_and_a_repeat_nothing_new():
+    trials = [FIRST, replace(FIRST, name='trial 2'), replace(FIRST, name='trial 2')]
+    first, second, third = gains(trials, Blind())
+    assert first.told == ('flexibility',)
+    assert second.told == ('friction',)
+    assert third.told == ()
+    assert first.after[1] == pytest.approx(UNKNOWN_STD)
+    assert first.words.startswith('trial 1 tells flexibility (± 28.9 -> ± ')
+    assert first.words.endswith(' of 100); nothing new about friction')
+    assert third.words == 'trial 2 adds nothing new: repeat it only to average noise'
+    assert second.values['std_before_friction'] == pytest.approx(100 * UNKNOWN_STD)
+    assert second.values['std_after_friction'] < 5
+    # a repeat of the same measurement leaves one over the square root of two
+    assert third.after[1] / third.before[1] == pytest.approx(0.5**0.5, rel=0.02)
+
+
+def test_what_a_trial_surely_does_not_show_is_not_simulated():
+    space, simulated = ParameterSpace(('flexibility', 'damping')), []
+    simulator = ToySimulator()
+    simulate = simulator.simulate
+    simulator.simulate = lambda trial, physical: simulated.append(physical) or simulate(trial, physical)
+    known = knowledge([FIRST], space, 0.0)
+    after = known.after(information(FIRST, known, space, simulator, 1.0, 0.0))
+    assert len(simulated) == 2  # either side in flexibility; damping does not show at rest
+    assert after.std[1] == pytest.approx(UNKNOWN_STD)
+
+
+class Restless(ToySimulator):
+    """It never comes to rest."""
+
+    def simulate(self, trial, physical):
+        rollout = super().simulate(trial, physical)
+        return Rollout(rollout.chains, (False,) * len(rollout.settled), rollout.duration, rollout.steps)
+
+
+def test_a_trial_that_does_not_come_to_rest_tells_what_it_tells():
+    known = knowledge([FIRST], SPACE, 0.0)
+    one, other = (information(FIRST, known, SPACE, toy, 1.0, 0.0) for toy in (Restless(), ToySimulator()))
+    assert one.tolist() == other.tolist()
+
+
+def test_a_trial_that_cannot_be_simulated_says_so():
+    known = knowledge([FIRST], SPACE, 0.0)
+    with pytest.raises(SimulationError, match='diverged'):
+        information(FIRST, known, SPACE, ToySimulator(fail_below=101.0), 1.0, 0.0)
+    gain = Gain.unknown('trial 3', SPACE.free, 'it diverged')
+    assert gain.words == 'what trial 3 tells is not known: it diverged'
+    assert gain.values == {}
+    assert gain.told == ()
+
+
+def stream(count):
+    """Return a trial as a tracker shows it: while the hand moves, and `count` times at rest."""
+    chain = FIRST.goals[0].chain
+    return replace(FIRST, goals=(
+        *(Goal(chain, time, stable=False) for time in np.linspace(0.5, 1.5, 21)),
+        *(Goal(chain, 2.0 + 0.03 * k) for k in range(count))))
+
+
+def test_a_tracker_that_goes_on_at_rest_changes_nothing():
+    known = knowledge([FIRST], SPACE, 0.0)
+    short, long = (information(stream(count), known, SPACE, ToySimulator(), 1.0, 0.0) for count in (1, 100))
+    assert short.tolist() == long.tolist()
+    assert [goal.stable for goal in glimpse(stream(100)).goals] == [False] * 5 + [True]
+
+
+def test_each_rest_counts():
+    hand = Hand('left_hand', (0,), np.array([4.0, 5.0]), FIRST.hands[0].positions[::-1])
+    chain = FIRST.goals[0].chain
+    twice = replace(FIRST, actions=(*FIRST.actions, type(FIRST.actions[0])((hand,))),
+                    goals=(Goal(chain, 2.0), Goal(chain, 3.0), Goal(chain, 6.0), Goal(chain, 7.0)))
+    assert [goal.time for goal in glimpse(twice).goals] == [2.0, 6.0]
+
+
+def noisy_trial(name, seed):
+    """Return a trial whose goal has 1 mm of white noise."""
+    trial = toy_trial(TRUTH, name)
+    points = trial.goals[0].chain.points + np.random.default_rng(seed).normal(0, 1e-3, (11, 3))
+    return replace(trial, goals=(Goal(Chain(points), 2.0),))
+
+
+def calibrated(simulator, *names):
+    trials = [noisy_trial(name, seed) for seed, name in enumerate(names)]
+    return calibrate(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
+
+
+def test_after_a_result_the_next_trial_adds_to_what_it_found():
+    result = calibrated(ToySimulator(), 'trial 1', 'trial 2')
+    assert covers(result)
+    known = knowledge(result.trials, SPACE, 0.0, result)
+    assert known.point.tolist() == result.best.point.tolist()
+    assert known.std == pytest.approx(result.examination.uncertainty.std, rel=1e-6)
+    again = Gain('trial 3', known.names, known.std, known.after(information(
+        FIRST, known, SPACE, ToySimulator(), 1.0, 0.0)).std)
+    assert again.told == ()
+
+
+def test_a_result_says_what_each_trial_told_alone():
+    result = calibrated(Blind(), 'trial 1', 'trial 2')
+    alone = told_by(result)
+    assert alone.shape == (2, 2)
+    assert alone[0, 1] == pytest.approx(UNKNOWN_STD)
+    assert (alone[[0, 1, 1], [0, 0, 1]] < 0.1).all()
+    assert silent(result) == ()
+
+
+def test_a_trial_that_told_nothing_is_named():
+    class Deaf(ToySimulator):
+        def simulate(self, trial, physical):
+            if trial.name == 'idle':
+                physical = SPACE.physical(TRUTH, 1.0)
+            return super().simulate(trial, physical)
+
+    result = calibrated(Deaf(), 'trial 1', 'idle', 'trial 3')
+    assert silent(result) == ('idle',)
+    assert silent(replace(result, examination=None)) == ()
