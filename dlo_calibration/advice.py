@@ -33,19 +33,22 @@ from numpy.typing import NDArray
 from dlo_calibration.action import Action
 from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.excitation import excites
 from dlo_calibration.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
 from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Goal, Trial
-from dlo_calibration.uncertainty import DEVIATIONS, Uncertainty
+from dlo_calibration.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 
 SMALLEST_STEP, LARGEST_STEP = 0.03, 0.25  # in the unit cube: as far as the parameter is unknown, within these
 WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's
+MOST_SIMULATED = 3  # actions that are simulated beside all values
+CLOSED = 0.05  # of the length: ends that are nearer count as together
 REST = 1.0  # s after which a goal is compared at rest
 WATCHED = 8  # instants at which a moving DLO is compared
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """An action that could be observed next, in words and as a trial whose goals are not known yet."""
 
@@ -80,9 +83,11 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
            uncertainty: Uncertainty, length: float,
            should_stop: Callable[[], bool] = lambda: False) -> Advice | None:
     """
-    Return the action that reduces the largest uncertainty most; None where none helps.
+    Return the action that reduces the largest uncertainty most; None where none helps, or nothing is open.
 
-    Where none tells about the parameter that is known worst, the next one is looked at.
+    Where none tells about the parameter that is known worst, the next one is looked at, as
+    long as it is not known well.  To spend few rollouts, each action that may show it is first simulated
+    beside the found value of that parameter only, then the `MOST_SIMULATED` best of them beside all.
 
     :param point: (d,) the found values in the unit cube.
     :param uncertainty: today's, with a covariance.
@@ -90,22 +95,46 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     """
     if uncertainty.covariance is None:
         return None
-    expected = []
-    for candidate in candidates(trials):
-        if should_stop():
-            return None
+    possible = list(candidates(trials))
+
+    def simulated(candidate: Candidate, shown: NDArray[np.bool_]) -> Floats | None:
         try:
-            expected.append((candidate, expected_std(candidate.trial, space, simulator, point, uncertainty,
-                                                     length)))
+            return sensitivity(candidate.trial, space, simulator, point, uncertainty.std, length, shown=shown)
         except (SimulationError, InputError):
-            continue  # cannot be done with this DLO
+            return None  # cannot be done with this DLO
+
     for k in np.argsort(-uncertainty.std, kind='stable'):
         now = float(uncertainty.std[k])
-        for candidate, std in sorted(expected, key=lambda pair: float(pair[1][k]))[:1]:
-            if std[k] < WORTH_IT * now:
-                reach = DEVIATIONS * float(std[k])
-                return Advice(candidate.action, candidate.words, space.free[k], now, float(std[k]),
-                              max(0.0, float(point[k]) - reach), min(1.0, float(point[k]) + reach))
+        if now < IDENTIFIABLE_STD:
+            return None
+        alone = np.arange(space.dimension) == k
+        promising: list[tuple[float, Candidate, Floats]] = []
+        for candidate in list(possible):
+            if should_stop():
+                return None
+            if not excites([candidate.trial], space, np.inf).table[0, k]:  # a table may be anywhere
+                continue
+            matrix = simulated(candidate, alone)
+            if matrix is None:
+                possible.remove(candidate)
+                continue
+            at_best = float((now**-2 + np.sum(matrix**2) / uncertainty.scale**2)**-0.5)  # all else known
+            if at_best < WORTH_IT * now:
+                promising.append((at_best, candidate, matrix))
+        best: tuple[float, Candidate] | None = None
+        for _, candidate, matrix in sorted(promising, key=lambda one: one[0])[:MOST_SIMULATED]:
+            if should_stop():
+                return None
+            rest = simulated(candidate, ~alone)
+            if rest is not None:
+                std = float(_expected(matrix + rest, uncertainty)[k])
+                if std < WORTH_IT * now and (best is None or std < best[0]):
+                    best = std, candidate
+        if best is not None:
+            std, candidate = best
+            reach = DEVIATIONS * std
+            return Advice(candidate.action, candidate.words, space.free[k], now, std,
+                          max(0.0, float(point[k]) - reach), min(1.0, float(point[k]) + reach))
     return None
 
 
@@ -116,8 +145,12 @@ def expected_std(trial: Trial, space: ParameterSpace, simulator: Simulator, poin
 
     :raises SimulationError: where it cannot be simulated or does not come to rest.
     """
+    return _expected(sensitivity(trial, space, simulator, point, uncertainty.std, length), uncertainty)
+
+
+def _expected(matrix: Floats, uncertainty: Uncertainty) -> Floats:
+    """Return (d,) standard deviations with a trial of that (m, d) sensitivity."""
     assert uncertainty.covariance is not None
-    matrix = sensitivity(trial, space, simulator, point, uncertainty.std, length)
     information = np.linalg.inv(uncertainty.covariance) + matrix.T @ matrix / uncertainty.scale**2
     return np.sqrt(np.diag(np.linalg.inv(information)))
 
@@ -177,6 +210,8 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
     yield from _candidate(
         'lift the first end and lay it across the DLO, beyond two thirds of it', chain,
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
+    if gap < CLOSED * length:
+        return  # no line along which to move the ends
     yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     apart = 1.03 * length - gap

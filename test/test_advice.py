@@ -1,0 +1,214 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which action is advised: where one alone would tell, where none would, and that it can be done."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_simulator import toy_trial, ToySimulator
+
+from dlo_calibration import calibrate, Chain, Goal, ParameterSpace, Rollout, SimulationError, Trial
+from dlo_calibration.advice import advise, candidates, expected_std
+from dlo_calibration.calibration import advised
+from dlo_calibration.named_actions import NAMED_ACTIONS
+from dlo_calibration.search import SEARCHES
+
+TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
+SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
+
+
+class Telling(ToySimulator):
+    """
+    It shows friction only in trials whose name has a given word.
+
+    :param worth: how much of it.
+    """
+
+    def __init__(self, word, worth=1.0):
+        super().__init__()
+        self.word, self.worth = word, worth
+        self.names = []
+
+    def simulate(self, trial, physical):
+        self.names.append(trial.name)
+        blind = {**physical, 'friction': SPACE.physical({'friction': 70.0}, 1.0)['friction']}
+        rollout = super().simulate(trial, blind)
+        if self.word not in trial.name:
+            return rollout
+        seen = super().simulate(trial, physical).chains
+        return replace(rollout, chains=rollout.chains + self.worth * (seen - rollout.chains))
+
+
+def observed(name, simulator=None, seed=0, trial=None):
+    """Return a trial with 1 mm of noise on what the simulator gives for the truth."""
+    trial = trial or toy_trial(TRUTH, name)
+    chains = (simulator or ToySimulator()).simulate(trial, SPACE.physical(TRUTH, 1.0)).chains
+    noise = np.random.default_rng(seed).normal(0, 1e-3, chains.shape)
+    return replace(trial, goals=tuple(replace(goal, chain=Chain(chain)) for goal, chain in zip(
+        trial.goals, chains + noise, strict=True)))
+
+
+def found(simulator, *trials):
+    return calibrate(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
+
+
+def advice_for(simulator, result, **rest):
+    return advise(result.trials, SPACE, simulator, result.best.point, result.examination.uncertainty,
+                  result.length, **rest)
+
+
+def test_the_only_action_that_tells_about_a_parameter_is_advised():
+    simulator = Telling('drag the middle')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert result.parameters['friction'].verdict == 'not identifiable'
+    advice = advice_for(simulator, result)
+    assert (advice.parameter, advice.action) == ('friction', 'drag')
+    assert advice.words == 'drag the middle sideways by 30 cm'
+    assert advice.std == pytest.approx(12**-0.5)
+    assert advice.expected_std < 0.05
+    assert advice.lower <= result.best.point[1] <= advice.upper
+
+
+def test_the_expected_deviation_is_what_a_calibration_with_that_trial_gives():
+    simulator = Telling('drag the middle')
+    trials = [observed(f'trial {k}', seed=k) for k in (1, 2)]
+    result = found(simulator, *trials)
+    advice = advice_for(simulator, result)
+    tried = next(one for one in candidates(trials) if one.words == advice.words).trial
+    again = found(simulator, *trials, observed(tried.name, simulator, 3, tried))
+    friction = again.parameters['friction']
+    assert friction.verdict == 'identifiable'
+    assert advice.expected_std == pytest.approx(friction.std / 100, rel=0.6)
+
+
+def test_nothing_is_advised_where_nothing_helps():
+    simulator = Telling('no such action')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert advice_for(simulator, result) is None
+
+
+def test_nothing_is_advised_and_simulated_where_all_is_known():
+    simulator = Telling('')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert {one.verdict for one in result.parameters.values()} == {'identifiable'}
+    simulator.names.clear()
+    assert advice_for(simulator, result) is None
+    assert simulator.names == []
+
+
+def test_the_action_that_tells_most_is_advised():
+    class Better(Telling):
+        def simulate(self, trial, physical):
+            self.worth = 0.3 if 'middle' in trial.name else 1.0
+            return super().simulate(trial, physical)
+
+    simulator = Better('drag')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert 'drag the first end' in advice_for(simulator, result).words
+
+
+def test_few_rollouts_are_spent():
+    simulator = Telling('drag')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    simulator.names.clear()
+    assert advice_for(simulator, result) is not None
+    count = len(list(candidates(result.trials)))
+    # Both sides in friction for each, both in flexibility for the best three.
+    assert len(simulator.names) <= 2 * count + 6
+
+
+class Failing(Telling):
+    """What would tell most diverges, or never comes to rest."""
+
+    def __init__(self, settles):
+        super().__init__('drag')
+        self.settles = settles
+
+    def simulate(self, trial, physical):
+        if 'drag the middle' in trial.name and not self.settles:
+            raise SimulationError('diverged')
+        rollout = super().simulate(trial, physical)
+        settled = 'drag the middle' not in trial.name
+        return Rollout(rollout.chains, (settled,) * len(rollout.settled), rollout.duration, rollout.steps)
+
+
+@pytest.mark.parametrize('settles', [False, True])
+def test_an_action_that_cannot_be_simulated_to_rest_is_not_advised(settles):
+    simulator = Failing(settles)
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    advice = advice_for(simulator, result)
+    assert 'drag' in advice.words
+    assert 'the middle' not in advice.words
+
+
+def test_a_stop_gives_no_advice():
+    simulator = Telling('drag')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert advice_for(simulator, result, should_stop=lambda: True) is None
+
+
+def test_a_result_that_is_no_minimum_gets_no_advice():
+    simulator = Telling('drag')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    assert advised(result, simulator).advice is not None
+    for examination in (None, replace(result.examination, regular=False)):
+        assert advised(replace(result, examination=examination), simulator).advice is None
+
+
+def test_what_is_expected_of_no_information_is_what_is_known():
+    simulator = Telling('drag')
+    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
+    lift = next(one for one in candidates(result.trials) if one.action == 'lift_and_hold')
+    std = expected_std(lift.trial, SPACE, simulator, result.best.point, result.examination.uncertainty, 1.0)
+    assert std[1] == pytest.approx(np.sqrt(result.examination.uncertainty.covariance[1, 1]), rel=1e-6)
+
+
+ALONG = np.linspace(0, 1, 11)
+SHAPES = {
+    'straight': np.stack([ALONG, 0 * ALONG, 0 * ALONG], axis=1),
+    'bent': np.stack([np.cos(3 * ALONG) / 3, np.sin(3 * ALONG) / 3, 0 * ALONG], axis=1),
+    'closed': np.stack([np.cos(2 * np.pi * ALONG), np.sin(2 * np.pi * ALONG), 0 * ALONG], axis=1) / 6,
+    'short': 0.02 * np.stack([ALONG, 0.1 * ALONG**2, 0 * ALONG], axis=1),
+    'vertical': np.stack([0 * ALONG, 0 * ALONG, 1 - ALONG], axis=1),
+    'of three points': np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0.1, 0]]),
+}
+
+
+@pytest.mark.parametrize('name', SHAPES)
+def test_advised_actions_can_be_done_with_a_chain_of_any_shape(name):
+    base = toy_trial(TRUTH, n=len(SHAPES[name]))
+    chain = Chain(SHAPES[name])
+    trial = Trial('trial 1', chain, base.actions, (Goal(chain, 2.0),))
+    some = list(candidates([trial]))
+    assert {one.action for one in some} >= {'lift_and_hold', 'drag', 'grasp_and_place'}
+    assert len({one.words for one in some}) == len(some)
+    for one in some:
+        assert one.action in NAMED_ACTIONS
+        assert one.trial.initial is chain
+        for hand in one.trial.hands:
+            assert np.isfinite(hand.positions).all()
+            assert hand.positions[0] == pytest.approx(chain.points[hand.grips[0]])
+        for goal in one.trial.goals:
+            assert goal.stable is ('while it moves' not in one.words)
+            assert bool(one.trial.holding(goal)) is (one.action in ('lift_and_hold', 'two_hands') or
+                                                    not goal.stable)
+
+
+def test_actions_begin_where_a_trial_began_at_rest():
+    moving = toy_trial(TRUTH)
+    moving = Trial('moving', moving.initial, moving.actions, moving.goals, np.ones((11, 3)))
+    resting = toy_trial(TRUTH, 'resting', turn=1.0)
+    assert all(one.trial.initial is resting.initial for one in candidates([moving, resting]))

@@ -1,0 +1,182 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is found around a point, on models whose answer is known."""
+
+import numpy as np
+import pytest
+
+from dlo_calibration.examination import examine, STEP, WIDEST
+from dlo_calibration.score import PointErrors
+
+SHAPES = ((1, 20), (2, 20), (1, 20))
+ROWS = 3 * sum(goals * points for goals, points in SHAPES)
+ENDS = np.cumsum([0, *(3 * goals * points for goals, points in SHAPES)])
+TRUTH = np.array([0.4, 0.6])
+DEFAULT = np.array([0.5, 0.7])
+NOISE = 1e-3
+
+
+def linear(seed=0):
+    """Return a (m, 2) Jacobian [m per unit cube]."""
+    return 0.1 * np.random.default_rng(seed).normal(size=(ROWS, 2))
+
+
+class Model:
+    """
+    It has residuals `errors + jacobian (x - truth)`, and remembers where it was asked.
+
+    :param fails: tells of a (d,) point whether it cannot be simulated.
+    """
+
+    def __init__(self, jacobian, errors, fails=lambda point: False):
+        self.jacobian, self.errors, self.fails = jacobian, errors, fails
+        self.asked = []
+
+    def at(self, point):
+        return self.errors + self.jacobian @ (point - TRUTH)
+
+    def __call__(self, points):
+        self.asked.extend(points)
+        return [None if self.fails(point) else self.at(point) for point in points]
+
+
+def noisy_model(seed=1, **rest):
+    return Model(linear(), np.random.default_rng(seed).normal(0, NOISE, ROWS), **rest)
+
+
+def optimum(model, rows=slice(None)):
+    return TRUTH - np.linalg.lstsq(model.jacobian[rows], model.errors[rows], rcond=None)[0]
+
+
+def examined(model, point=None, **rest):
+    point = optimum(model) if point is None else point
+    return examine(point, model.at(point), SHAPES, model, default=DEFAULT, noise=NOISE, **rest)
+
+
+def test_the_jacobian_of_a_linear_model_is_recovered():
+    model = noisy_model()
+    found = examined(model)
+    assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+    assert found.regular
+    assert found.noise == NOISE
+    assert found.evaluations == len(model.asked)
+    assert found.uncertainty.verdicts == ('identifiable', 'identifiable')
+
+
+def test_steps_are_small_where_a_parameter_is_known_well_and_wide_where_it_is_not():
+    model = noisy_model()
+    model.jacobian[:, 1] *= 1e-3  # it moves the points by a tenth of the noise over its scale
+    point = optimum(model)
+    point[1] = 0.6
+    found = examined(model, point)
+    away = np.abs(np.array(model.asked) - point).round(9)
+    beside = [away[away[:, 1 - k] == 0][:, k] for k in range(2)]
+    assert set(beside[0]) <= {0, STEP}
+    assert beside[1].max() == pytest.approx(WIDEST)
+    assert found.jacobian[:, 1] == pytest.approx(model.jacobian[:, 1], abs=1e-9)
+    assert found.uncertainty.verdicts[1] == 'not identifiable'
+
+
+def test_no_point_leaves_the_unit_cube():
+    model = noisy_model()
+    for point in ([0.0, 1.0], [0.01, 0.99]):
+        found = examined(model, np.array(point))
+        assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+    assert np.min(model.asked) >= 0
+    assert np.max(model.asked) <= 1
+
+
+def test_cross_validation_is_the_error_of_refits_without_each_trial():
+    model = noisy_model()
+    distances = []
+    for first, last in zip(ENDS[:-1], ENDS[1:], strict=True):
+        others = np.r_[0:first, last:ROWS]
+        left = model.at(optimum(model, others))[first:last]
+        distances.append(np.linalg.norm(left.reshape(-1, 3), axis=1))
+    found = examined(model)
+    assert found.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=1e-6)
+    assert found.cross_validated > PointErrors.of(model.at(optimum(model))).mean
+
+
+def test_one_trial_cannot_be_cross_validated():
+    model = noisy_model()
+    point = optimum(model)
+    found = examine(point, model.at(point), [(1, ROWS // 3)], model, default=DEFAULT, noise=NOISE)
+    assert np.isnan(found.cross_validated)
+
+
+def test_the_error_of_the_defaults_is_simulated():
+    model = noisy_model()
+    assert examined(model).default_error == pytest.approx(PointErrors.of(model.at(DEFAULT)).mean)
+    model.fails = lambda point: np.array_equal(point, DEFAULT)
+    assert np.isnan(examined(model).default_error)
+
+
+@pytest.mark.parametrize(('away', 'regular'), [(0.0, True), (0.3, False)])
+def test_a_point_from_which_it_goes_on_downhill_is_no_minimum(away, regular):
+    model = noisy_model()
+    assert examined(model, optimum(model) + [away, 0.0]).regular is regular
+
+
+def test_where_one_side_fails_the_other_gives_the_derivative():
+    model = noisy_model(fails=lambda point: point[0] > 0.41)
+    found = examined(model)
+    assert found.jacobian == pytest.approx(model.jacobian, abs=1e-9)
+
+
+def test_where_both_sides_fail_the_parameter_counts_as_not_excited():
+    model = noisy_model()
+    point = optimum(model)
+    model.fails = lambda other: other[0] != point[0] and not np.array_equal(other, DEFAULT)
+    found = examined(model)
+    assert not found.jacobian[:, 0].any()
+    assert found.uncertainty.excited.tolist() == [False, True]
+
+
+def test_a_finer_simulation_widens_what_it_moves():
+    model = noisy_model()
+    shift = np.array([0.1, 0.0])
+    finer = Model(model.jacobian, model.errors - model.jacobian @ shift)
+    plain, found = examined(model), examined(model, finer=finer)
+    assert found.uncertainty.std[0] == pytest.approx(np.hypot(plain.uncertainty.std[0], 0.1), rel=0.02)
+    assert found.uncertainty.std[1] == pytest.approx(plain.uncertainty.std[1], rel=0.02)
+    assert found.evaluations == plain.evaluations + 1
+    assert len(finer.asked) == 1
+
+
+def test_a_finer_simulation_that_fails_leaves_nothing_known():
+    found = examined(noisy_model(), finer=lambda points: [None])
+    assert found.uncertainty.verdicts == ('not identifiable', 'not identifiable')
+
+
+def test_a_stop_in_the_middle_is_passed_on():
+    class Stopped(Exception):
+        pass
+
+    def stopping(points):
+        raise Stopped
+
+    model = noisy_model()
+    with pytest.raises(Stopped):
+        examine(TRUTH, model.at(TRUTH), SHAPES, stopping, default=DEFAULT, noise=NOISE)
+
+
+def test_the_band_says_how_far_points_may_lie_elsewhere():
+    found = examined(noisy_model())
+    assert found.band.shape == (ROWS // 3,)
+    # As many points as there are share what the two parameters do not know.
+    covariance = found.uncertainty.covariance
+    expected = np.sqrt(np.trace(found.jacobian @ covariance @ found.jacobian.T))
+    assert np.sqrt(np.sum(found.band**2)) == pytest.approx(expected)
