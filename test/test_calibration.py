@@ -79,6 +79,33 @@ def test_a_parameter_without_effect_is_not_identifiable():
     assert not result.parameters['damping'].identifiable
 
 
+def searched(space, truth=TRUTH):
+    """Return what least squares finds on two trials."""
+    trials = (toy_trial(truth), toy_trial(truth, 'trial 2', turn=1.0))
+    return calibrate(trials, space, ToySimulator(), search(space, name='least_squares'), budget=120)
+
+
+def test_a_parameter_that_no_trial_tells_about_keeps_its_default_and_says_so():
+    space = ParameterSpace(('flexibility', 'damping'), {k: v for k, v in TRUTH.items() if k != 'flexibility'})
+    result = searched(space)
+    assert result.parameters['flexibility'].value == pytest.approx(TRUTH['flexibility'], abs=0.01)
+    damping = result.parameters['damping']
+    assert (damping.value, damping.lower, damping.upper) == (50.0, 0.0, 100.0)
+    assert damping.verdict == 'not identifiable'
+    assert damping.note == 'no trial tells anything about it; it keeps its default'
+    assert result.best.values == result.values
+
+
+def test_a_value_at_the_end_of_the_scale_is_noted_at_either_end():
+    truth = {**TRUTH, 'flexibility': 0.0, 'friction': 100.0}
+    result = searched(ParameterSpace(('flexibility', 'friction', 'elasticity'),
+                                     {'self_collision': TRUTH['self_collision']}), truth)
+    assert {name for name, one in result.parameters.items() if 'at the end of its scale' in one.note} == {
+        'flexibility', 'friction'}
+    assert result.parameters['friction'].upper == 100.0
+    assert result.parameters['flexibility'].lower == 0.0
+
+
 def test_physical_values_beside_the_scale():
     result = found(space=ParameterSpace(mass=0.05), budget=30)
     for name, estimate in result.parameters.items():

@@ -108,6 +108,17 @@ def test_flags_come_before_recorded_options_and_say_so(run, session):
     assert 'evaluations: 5 instead of 20' in errors
 
 
+def test_correlations_are_between_the_parameters_by_name(run, session):
+    found = only_json(run('fit', session, '--json', '--evaluations', 150)[1])
+    names = list(Options().calibrate)
+    assert list(found['correlations']) == names
+    for one in names:
+        assert list(found['correlations'][one]) == names
+        assert found['correlations'][one][one] == pytest.approx(1)
+        for other in names:
+            assert found['correlations'][one][other] == pytest.approx(found['correlations'][other][one])
+
+
 def test_every_key_of_the_document_is_documented():
     text = (Path(__file__).parents[1] / 'doc/messages.md').read_text(encoding='utf-8')
     assert {key for key in FIT_KEYS | PARAMETER_KEYS if f'`{key}`' not in text} == set()
