@@ -139,7 +139,8 @@ def description_document(found: CalibrationResult | Description,
     add_chain(root, 'chain', dlo.chain)
     parameters = add(root, 'parameters')
     for estimate in dlo.parameters.values():
-        add(parameters, 'found', **asdict(estimate))
+        words = {name: getattr(estimate, name) or None for name in ('verdict', 'note')}  # None is left out
+        add(parameters, 'found', **{**asdict(estimate), **words})
     for name, value in dlo.fixed.items():
         physical, unit = space.reported(name, value)
         add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)

@@ -109,6 +109,13 @@ def test_writing_what_was_read_gives_the_same_bytes(file):
     assert description_document(read_result(file)) == file.read_bytes()
 
 
+def test_a_document_from_before_there_were_verdicts_stays_as_it_is(file):
+    older = re.sub(rb' (verdict|note)="[^"]*"', b'', file.read_bytes())
+    assert older != file.read_bytes()
+    file.write_bytes(older)
+    assert description_document(read_result(file)) == older
+
+
 def test_document_is_for_people_too(file):
     lines = file.read_text(encoding='utf-8').splitlines()
     assert lines[0] == "<?xml version='1.0' encoding='UTF-8'?>"
