@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean
+.PHONY: help demo experiment test lint bench clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -32,6 +32,7 @@ help:
 	@cat <<-END
 	  make demo    calibrate a sample session with the real node, and draw the result
 	  make test    run all tests
+	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make bench   measure speed, memory and start-up, and compare the engines
 	  make clean   remove .venv and everything that was built
@@ -39,6 +40,9 @@ help:
 
 demo: $(STAMP)
 	@$(PYTHON) -m dlo_calibration.demo
+
+experiment: $(STAMP)
+	@$(PYTHON) -m dlo_calibration experiment
 
 test: $(STAMP)
 	@$(PYTHON) -m pytest

@@ -28,12 +28,14 @@ import sys
 import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
+from dlo_calibration import experiment_report, experiment_verb
 from dlo_calibration.calibration import CalibrationResult, Evaluator, simulated_chains
 from dlo_calibration.config import Declaration, declarations, Options
 from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+from dlo_calibration.experiment import Observed
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials, trial_records
@@ -55,7 +57,7 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
 
     :param args: without the program's name; None: that of the process.
     :returns: exit code: 0; 2 for what cannot be used, after one line on stderr; 130 where
-        Ctrl-C came before there was anything to report.
+        Ctrl-C came before there was anything to report, or before an experiment was complete.
     """
     try:
         chosen = _parser().parse_args(args)
@@ -94,6 +96,10 @@ def _parser() -> argparse.ArgumentParser:
     validate.add_argument('result', metavar='RESULT.xml', type=Path)
     info = verb('info', _info, 'say what is in a session')
     plot = verb('plot', _plot, 'draw a picture of each trial: measured, and simulated with a result')
+    experiment = verb('experiment', _experiment,
+                      "repeat the paper's experiment: how consistent found parameters are, and how valid")
+    experiment_verb.add_arguments(experiment)
+    _add_options(experiment, without=experiment_verb.NOT_AN_OPTION)
     for added in (fit, validate, plot, info):
         added.add_argument('session', metavar='SESSION', type=Path,
                            help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
@@ -111,10 +117,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_options(parser: argparse.ArgumentParser) -> None:
+def _add_options(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
     """Add a flag for every option; what is not given is absent from the parsed ones."""
     group = parser.add_argument_group('options of the calibrator (default: as the session was recorded)')
-    for declaration in declarations():
+    for declaration in (one for one in declarations() if one.name not in without):
         names = dict.fromkeys((f'--{declaration.name.replace("_", "-")}', f'--{declaration.name}'))
         group.add_argument(*names, dest=f'option_{declaration.name}', default=argparse.SUPPRESS,
                            **_flag(declaration))
@@ -420,6 +426,27 @@ def _write_session(path: Path, source: Path, found: _Input) -> None:
 def _copy(source: Path, target: Path) -> None:
     if not (target.exists() and target.samefile(source)):
         shutil.copyfile(source, target)
+
+
+def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    given = _given(chosen)
+
+    def observe(path: Path, of_result: Mapping[str, Any] | None = None) -> Observed:
+        one = argparse.Namespace(**{**vars(chosen), 'session': path})
+        found = _read(one, lambda text: _note(f'{path}: {text}'), of_result)
+        return Observed(_some(found), found.options)
+
+    flags = [flag for name, value in given.items() for flag in _as_flags(name, value)]
+    plan = experiment_verb.planned(chosen, given, [PROGRAM, 'experiment'], flags, observe)
+    with StopFlag() as stop:
+        account = experiment_verb.act(plan, chosen.output, make_simulator, stop, _note, sys.stderr)
+    if account is None:
+        raise KeyboardInterrupt
+    if chosen.json:
+        _print_json(experiment_report.document(account), sys.stdout)
+    else:
+        sys.stdout.write(experiment_report.markdown(account))
+    return 0 if account.complete else INTERRUPTED
 
 
 def _info(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:

@@ -37,9 +37,10 @@ from dlo_calibration.cli import document, validated
 from dlo_calibration.config import Options
 from dlo_calibration.description import read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES
-from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.messages import INPUT_TYPES, rclpy_types
 from dlo_calibration.picture import session_picture
+from dlo_calibration.samples import samples
 from dlo_calibration.session import read_session, Session, session_trials
 from dlo_calibration.signals import StopFlag
 
@@ -67,18 +68,6 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return 0
-
-
-def samples() -> Path:
-    """Return the folder of the sample sessions: of the sources, or where they are installed."""
-    beside = Path(__file__).resolve().parents[1] / 'msg_samples'
-    shared = Path('share') / 'dlo_calibration' / 'msg_samples'
-    prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
-    for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):
-        if folder.is_dir():
-            return folder
-    raise InputError('demo', 'no folder msg_samples', f'{beside} or $AMENT_PREFIX_PATH/{shared}',
-                     'install the package with its samples, or name a session with --sample')
 
 
 def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]) -> None:

@@ -71,6 +71,35 @@ class SearchBar:
         self._progress.update(self._task, completed=count, best=f'{best:.1f}' if best < float('inf') else '-')
 
 
+class TaskBar:
+    """
+    A progress bar with the time left, on a terminal; elsewhere nothing is shown.
+
+    :param what: is counted.
+    :param done: how many of the `total` are done already.
+    """
+
+    def __init__(self, what: str, total: int, done: int, stream: TextIO) -> None:
+        self.shown = stream.isatty()
+        self._progress = Progress(
+            TextColumn(escape(what)), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            console=console(stream), disable=not self.shown)
+        self._task = self._progress.add_task('', total=total, completed=done)
+
+    def __enter__(self) -> TaskBar:
+        """Show it."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave it as it is."""
+        self._progress.stop()
+
+    def advance(self) -> None:
+        """Count one more."""
+        self._progress.advance(self._task)
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """Return a number as people read it; a dash for none."""
     return '-' if value is None else f'{value:.{digits}g}'

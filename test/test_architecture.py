@@ -28,7 +28,7 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 #: A module imports only from those before it; the modules of a subpackage share its place.
 ORDER = (
     # pure NumPy and SciPy
-    'errors', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
+    'errors', 'samples', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
     'search', 'confirmation', 'uncertainty', 'examination', 'advice', 'calibration', '__init__', 'config',
     'parameter_file', 'gain', 'findings',
@@ -39,8 +39,9 @@ ORDER = (
     # engines
     'rollout', 'contact', 'natural', 'twist', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
-    'pool', 'cluster', 'worker', 'appraiser', 'picture', 'animation', 'plot', 'terminal', 'report',
-    'signals', 'recorder', 'options_node', 'node',
+    'pool', 'cluster', 'worker', 'appraiser', 'experiment', 'experiment_summary', 'picture', 'animation',
+    'plot', 'terminal', 'report', 'experiment_report', 'experiment_verb', 'signals', 'recorder',
+    'options_node', 'node',
     'calibrator', 'cli', '__main__', 'demo',
 )
 

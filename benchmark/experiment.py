@@ -1,0 +1,69 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Repeat the paper's experiment on the reference objects, judged by five actions that the samples lack.
+
+    python benchmark/experiment.py [--runs N] [--output DIR]
+
+The sessions are made of the measured data, which DLO_DATA names.  What is done
+in DIR is not done again.  The tables are written to benchmark/results/experiment_other.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+
+HERE = Path(__file__).resolve().parent
+OBJECTS = tuple(f'object{k}' for k in range(1, 6))
+
+
+def convert(name: str, output: Path, actions: str) -> Path:
+    """Make a session with convert.py."""
+    subprocess.run([sys.executable, str(HERE / 'convert.py'), 'reference', name, str(output),
+                    '--actions', actions], check=True, stdout=subprocess.DEVNULL)
+    return output
+
+
+def main() -> None:
+    """Make the tables."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--runs', default='20')
+    parser.add_argument('--output', type=Path, default=Path('experiment_output_other'))
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        fitted = [convert(name, folder / name, 'fitted') for name in OBJECTS]
+        other = [convert(name, folder / f'{name}_other', 'other') for name in OBJECTS]
+        done = subprocess.run(
+            [sys.executable, '-m', 'dlo_calibration', 'experiment', *map(str, fitted), '--validate-on',
+             *map(str, other), '--runs', arguments.runs, '--output', str(arguments.output)],
+            check=True, stdout=subprocess.PIPE, text=True,
+            env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
+    text = done.stdout.replace(f'{folder}/', '')
+    print(text)
+    command = f'`python benchmark/experiment.py --runs {arguments.runs}`, which does'
+    (HERE / 'results' / 'experiment_other.md').write_text(
+        text.replace('# Consistency and validity\n',
+                     f'# Consistency and validity, judged by five other actions\n\n{command}\n', 1))
+
+
+if __name__ == '__main__':
+    main()

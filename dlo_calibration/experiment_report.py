@@ -1,0 +1,256 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Experiment report: the tables of an experiment as Markdown, CSV and plain values; its pictures."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import asdict, dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration.experiment import Outcome, Task
+from dlo_calibration.experiment_summary import complete_runs, Findings, Spread
+from dlo_calibration.picture import as_text, blank_figure, DOTS_PER_INCH, MILLIMETRES, unwritable
+from dlo_calibration.score import SIMILAR, VERY_SIMILAR
+
+UNKNOWN = 'not known to us'
+#: Figures of the paper: of its five objects, by the names of the samples that resemble them.
+PAPER_VALIDITY: Mapping[str, float] = {'object5': 53.0}
+PAPER_SCATTER = (10.0, 28.0)
+COLOURS = ('tab:blue', 'tab:orange', 'tab:green', 'tab:purple')
+
+
+@dataclass(frozen=True)
+class Account:
+    """
+    An experiment as it is told.
+
+    :param findings: of each object and search.
+    :param command: that repeats it.
+    :param engine: that simulated.
+    :param runs: of each object and search that were asked for.
+    :param evaluations: of a search at most.
+    :param samples: whether the objects are the package's samples, which resemble the paper's.
+    :param complete: whether everything that was asked for is done.
+    """
+
+    findings: tuple[Findings, ...]
+    command: str
+    engine: str
+    runs: int
+    evaluations: int
+    samples: bool
+    complete: bool
+
+    @property
+    def searches(self) -> tuple[str, ...]:
+        """Names of the searches."""
+        return tuple(dict.fromkeys(one.search for one in self.findings))
+
+
+def document(account: Account) -> dict[str, Any]:
+    """Return the account as plain values."""
+    paper = {'validity': dict(PAPER_VALIDITY), 'scatter': list(PAPER_SCATTER)} if account.samples else None
+    return {'command': account.command, 'engine': account.engine, 'runs': account.runs,
+            'evaluations': account.evaluations, 'complete': account.complete,
+            'paper': paper, 'findings': [asdict(one) for one in account.findings]}
+
+
+def markdown(account: Account) -> str:
+    """Return the account as Markdown."""
+    parts = [
+        '# Consistency and validity', f'`{account.command}`',
+        f'{account.runs} runs of each object and search, with a random seed each; at most '
+        f'{account.evaluations} evaluations a calibration; engine {account.engine}.']
+    if not account.complete:
+        parts.append('**Not complete**: the tables are of the runs that are done; '
+                     'the same command does the others.')
+    parts += ['## Consistency', 'Average and standard deviation of each parameter over the runs, on the '
+              'scale from 0 to 100, calibrated on all trials.  *Italic*: the trials tell nothing about it, '
+              'so it keeps its default; with a number of runs, in only that many they told something.']
+    if account.samples:
+        parts.append(f'The paper says of its own runs that parameters scatter by {PAPER_SCATTER[0]:g} to '
+                     f'{PAPER_SCATTER[1]:g}; its figures for each object are {UNKNOWN}.')
+    for search in account.searches:
+        parts += [f'### {search}', _consistency([one for one in account.findings if one.search == search])]
+    parts += ['## Validity', 'Average and standard deviation, over the runs, of the difference score of '
+              'actions that were not calibrated on, and of their point error.  '
+              f'**Bold**: below {VERY_SIMILAR:g}, very similar; below {SIMILAR:g} is similar.  '
+              'Seconds are of one calibration on all trials, in one process.', _validity(account)]
+    if any(one.actions for one in account.findings):
+        parts += ['Difference score of each action by itself:', _actions(account)]
+    return '\n\n'.join(parts) + '\n'
+
+
+def consistency_csv(account: Account) -> str:
+    """Return a row for each object, search and parameter."""
+    return _csv(('object', 'search', 'parameter', 'runs', 'mean', 'std', 'runs_that_told_anything'), (
+        (one.subject, one.search, name, spread.count, spread.mean, spread.std, one.informed[name])
+        for one in account.findings for name, spread in one.parameters.items()))
+
+
+def validity_csv(account: Account) -> str:
+    """Return a row for each object and search, then one for each of their actions."""
+    rows: list[tuple[Any, ...]] = []
+    for one in account.findings:
+        rows.append((one.subject, one.search, 'all', one.runs, _mean(one.score), _std(one.score),
+                     _mean(one.error), _std(one.error), _mean(one.share), _std(one.share), one.very_similar,
+                     _mean(one.evaluations), _mean(one.seconds), one.failures))
+        rows += [(one.subject, one.search, name, spread.count, spread.mean, spread.std)
+                 for name, spread in one.actions.items()]
+    return _csv(('object', 'search', 'action', 'runs', 'score_mean_cm', 'score_std_cm', 'error_mean_m',
+                 'error_std_m', 'error_mean_percent', 'error_std_percent', 'very_similar_runs', 'evaluations',
+                 'seconds', 'failures'), rows)
+
+
+def runs_csv(done: Sequence[tuple[Task, Outcome]]) -> str:
+    """Return a row for each calibration."""
+    names = list(dict.fromkeys(name for task, _ in done for name in task.options.space.free))
+    rows = []
+    for task, one in done:
+        scores = [judged.score for judged in one.judgements]
+        rows.append((
+            task.subject.name, task.search, task.seed, '' if task.left_out is None else task.left_out + 1,
+            *(one.values.get(name) for name in names), one.score, one.error,
+            ' '.join('failed' if score is None else repr(score) for score in scores),
+            ' '.join('failed' if judged.error is None else repr(judged.error) for judged in one.judgements),
+            one.evaluations, one.simulations, one.seconds, one.failure))
+    return _csv(('object', 'search', 'seed', 'left_out_trial', *names, 'score_cm', 'error_m',
+                 'held_back_scores_cm', 'held_back_errors_m', 'evaluations', 'simulations', 'seconds',
+                 'failure'), rows)
+
+
+def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) -> None:
+    """
+    Draw the parameters that every run found, the searches beside each other.
+
+    :param done: the calibrations of each object and search.
+    :raises InputError: where the file cannot be written.
+    """
+    subjects = list(dict.fromkeys(group[0][0].subject.name for group in done))
+    searches = list(dict.fromkeys(group[0][0].search for group in done))
+    names = list(dict.fromkeys(name for group in done for name in group[0][0].options.space.free))
+    figure = blank_figure(max(7.0, 2.0 + 2.0 * len(subjects)), 1.0 + 2.4 * len(names))
+    rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for group in done:
+        task = group[0][0]
+        which = searches.index(task.search)
+        whole = [outcome for run in complete_runs(group) for one, outcome in run
+                 if one.left_out is None and not outcome.failure]
+        middle = subjects.index(task.subject.name) + (which - (len(searches) - 1) / 2) * 0.8 / len(searches)
+        places = middle + np.linspace(-0.3, 0.3, len(whole)) / len(searches)
+        for name, axes in zip(names, rows, strict=True):
+            for place, outcome in zip(places, whole, strict=True):
+                if name in outcome.values:
+                    told = name in outcome.excited
+                    axes.plot(place, outcome.values[name], 'o' if told else 'x', markersize=4, alpha=0.8,
+                              color=COLOURS[which % len(COLOURS)] if told else '0.6')
+    for name, axes in zip(names, rows, strict=True):
+        axes.set(ylabel=f'{name} [0..100]', ylim=(-3, 103))
+        axes.grid(axis='y', alpha=0.3)
+    rows[-1].set_xticks(range(len(subjects)), [as_text(one) for one in subjects])
+    rows[-1].set_xlim(-0.6, len(subjects) - 0.4)
+    for which, search in enumerate(searches):
+        rows[0].plot([], [], 'o', color=COLOURS[which % len(COLOURS)], label=search)
+    rows[0].plot([], [], 'x', color='0.6', label='the trials tell nothing: default')
+    figure.legend(loc='outside upper center', ncols=len(searches) + 1, frameon=False)
+    try:
+        figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _consistency(findings: Sequence[Findings]) -> str:
+    names = list(dict.fromkeys(name for one in findings for name in one.parameters))
+    rows: list[list[str]] = []
+    for one in findings:
+        average, deviation = [one.subject, 'average'], ['', 'standard deviation']
+        for name in names:
+            spread = one.parameters.get(name)
+            told = one.informed.get(name, 0)
+            mean, std = _number(_mean(spread), 1), _number(_std(spread), 2)
+            if spread and not told:
+                mean, std = f'*{mean}*', f'*{std}*'
+            elif spread and told < spread.count:
+                mean = f'{mean} *(in {told} of {spread.count} runs)*'
+            average.append(mean)
+            deviation.append(std)
+        rows += [average, deviation]
+    return _table(('object', '', *names), rows)
+
+
+def _validity(account: Account) -> str:
+    head = ['object', 'search', 'score, average', 'standard deviation', 'very similar', 'worst action',
+            'mean error, mm', 'standard deviation', '% of length', 'fitted trials, mm', 'evaluations',
+            'seconds']
+    rows = []
+    for one in account.findings:
+        score, count = _mean(one.score), one.score.count if one.score else 0
+        shown = _number(score, 1)
+        rows.append([
+            one.subject, one.search, f'**{shown}**' if score is not None and score < VERY_SIMILAR else shown,
+            _number(_std(one.score), 2), f'{one.very_similar} of {count} runs', _number(one.worst, 1),
+            _number(_mean(one.error), 2, MILLIMETRES), _number(_std(one.error), 2, MILLIMETRES),
+            _number(_mean(one.share), 2), _number(_mean(one.fitted), 2, MILLIMETRES),
+            _number(_mean(one.evaluations), 0), _number(_mean(one.seconds), 1)])
+    if account.samples:
+        head.append('score in the paper')
+        for row in rows:
+            row.append(f'{PAPER_VALIDITY[row[0]]:g}' if row[0] in PAPER_VALIDITY else UNKNOWN)
+    if any(one.failures for one in account.findings):
+        head.append('failed')
+        for row, one in zip(rows, account.findings, strict=True):
+            row.append(str(one.failures))
+    return _table(head, rows)
+
+
+def _actions(account: Account) -> str:
+    names = list(dict.fromkeys(name for one in account.findings for name in one.actions))
+    return _table(('object', 'search', *names), (
+        (one.subject, one.search, *(_both(one.actions.get(name)) for name in names))
+        for one in account.findings))
+
+
+def _both(spread: Spread | None) -> str:
+    return '-' if spread is None else f'{_number(spread.mean, 1)} ± {_number(spread.std, 1)}'
+
+
+def _number(value: float | None, digits: int, unit: float = 1.0) -> str:
+    return '-' if value is None else f'{value * unit:.{digits}f}'
+
+
+def _mean(spread: Spread | None) -> float | None:
+    return None if spread is None else spread.mean
+
+
+def _std(spread: Spread | None) -> float | None:
+    return None if spread is None else spread.std
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = (head, ['---'] * len(head), *rows)
+    return '\n'.join(f'| {" | ".join(cell.replace("|", chr(92) + "|") for cell in row)} |' for row in lines)
+
+
+def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    stream = StringIO()
+    writer = csv.writer(stream, lineterminator='\n')
+    writer.writerow(head)
+    writer.writerows([*row, *[''] * (len(head) - len(row))] for row in rows)
+    return stream.getvalue()

@@ -1,0 +1,135 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Summary: what many calibrations of the same objects say of consistency and validity, in numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration.experiment import Outcome, Task
+from dlo_calibration.score import VERY_SIMILAR
+
+
+@dataclass(frozen=True)
+class Spread:
+    """
+    Mean and standard deviation of a number over runs.
+
+    :param std: of a sample; None with fewer than two runs.
+    """
+
+    mean: float
+    std: float | None
+    count: int
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Spread | None:
+        """Return that of some numbers; None of none."""
+        if not numbers:
+            return None
+        return cls(float(np.mean(numbers)), float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None,
+                   len(numbers))
+
+
+@dataclass(frozen=True)
+class Findings:
+    """
+    What all runs of one search found about one object.
+
+    :param parameters: consistency: each parameter, 0..100, where nothing was left out.
+    :param informed: in how many runs the trials told anything about each; else it has its default.
+    :param fitted: mean point error of the trials calibrated on [m].
+    :param score: validity: each run's average difference score over the actions it is judged by [cm].
+    :param very_similar: in how many runs that is below 50.
+    :param error: each run's mean point error of those actions [m].
+    :param share: the same in percent of the length.
+    :param actions: the score of each action by itself, by the name of its trial.
+    :param worst: highest score of one action in one run.
+    :param failures: calibrations that failed, and actions that could not be simulated.
+    """
+
+    subject: str
+    search: str
+    runs: int
+    parameters: Mapping[str, Spread]
+    informed: Mapping[str, int]
+    fitted: Spread | None
+    score: Spread | None
+    very_similar: int
+    error: Spread | None
+    share: Spread | None
+    actions: Mapping[str, Spread]
+    worst: float | None
+    evaluations: Spread | None
+    seconds: Spread | None
+    failures: int
+
+
+def complete_runs(done: Sequence[tuple[Task, Outcome]]) -> list[list[tuple[Task, Outcome]]]:
+    """Return the calibrations of one subject and search, by run; those of unfinished runs are left out."""
+    by_seed: dict[int, list[tuple[Task, Outcome]]] = {}
+    for task, outcome in done:
+        by_seed.setdefault(task.seed, []).append((task, outcome))
+    return [found for _, found in sorted(by_seed.items())
+            if len(found) == 1 + len(found[0][0].subject.held_back)]
+
+
+def run_score(found: Sequence[tuple[Task, Outcome]]) -> float | None:
+    """Return the average difference score of a run over the actions it is judged by [cm]; None: none is."""
+    return _mean([one.score for _, outcome in found for one in outcome.judgements])
+
+
+def _mean(numbers: Sequence[float | None]) -> float | None:
+    known = [one for one in numbers if one is not None]
+    return float(np.mean(known)) if known else None
+
+
+def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:
+    """Summarise the calibrations, at least one, of one subject with one search."""
+    runs = complete_runs(done)
+    subject, search = done[0][0].subject, done[0][0].search
+    whole = [outcome for found in runs for task, outcome in found
+             if task.left_out is None and not outcome.failure]
+    judged = [[one for _, outcome in found for one in outcome.judgements] for found in runs]
+    scores = [score for found in runs if (score := run_score(found)) is not None]
+    by_action: dict[str, list[float]] = {}
+    for found in judged:
+        for one in found:
+            by_action.setdefault(one.trial, []).extend([] if one.score is None else [one.score])
+
+    def over_runs(values: Iterator[float | None]) -> Spread | None:
+        return Spread.of([value for value in values if value is not None])
+
+    def parameter(name: str) -> Spread | None:
+        return Spread.of([outcome.values[name] for outcome in whole])
+
+    free = subject.observed.options.space.free
+    return Findings(
+        subject=subject.name, search=search, runs=len(runs),
+        parameters={name: spread for name in free if (spread := parameter(name)) is not None},
+        informed={name: sum(name in outcome.excited for outcome in whole) for name in free},
+        fitted=over_runs(outcome.error for outcome in whole),
+        score=Spread.of(scores), very_similar=sum(score < VERY_SIMILAR for score in scores),
+        error=over_runs(_mean([one.error for one in found]) for found in judged),
+        share=over_runs(_mean([one.share for one in found]) for found in judged),
+        actions={name: spread for name, values in by_action.items() if (spread := Spread.of(values))},
+        worst=max((score for values in by_action.values() for score in values), default=None),
+        evaluations=Spread.of([outcome.evaluations for outcome in whole]),
+        seconds=Spread.of([outcome.seconds for outcome in whole]),
+        failures=sum(bool(outcome.failure) for found in runs for _, outcome in found)
+        + sum(one.score is None for found in judged for one in found))

@@ -1,0 +1,35 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Samples: where the sessions that ship with the package are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import sys
+
+from dlo_calibration.errors import InputError
+
+
+def samples() -> Path:
+    """Return the folder of the sample sessions: of the sources, or where they are installed."""
+    beside = Path(__file__).resolve().parents[1] / 'msg_samples'
+    shared = Path('share') / 'dlo_calibration' / 'msg_samples'
+    prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):
+        if folder.is_dir():
+            return folder
+    raise InputError('samples', 'no folder msg_samples', f'{beside} or $AMENT_PREFIX_PATH/{shared}',
+                     'install the package with its samples, or name a session')

@@ -1,0 +1,200 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The experiment: which calibrations there are, what one finds, and what is written down of it."""
+
+from concurrent.futures import CancelledError
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials, TRUTH
+from toy_simulator import ToySimulator
+
+from dlo_calibration.calibration import calibrate
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.experiment import (
+    Journal,
+    judged_chains,
+    Judgement,
+    Observed,
+    Outcome,
+    perform,
+    Subject,
+    Task,
+    tasks,
+)
+from dlo_calibration.search import SEARCHES
+from dlo_calibration.trial import Trial
+from dlo_calibration.worker import hints
+
+OPTIONS = Options.of({'evaluations': 40})
+
+
+def toy(options):
+    return ToySimulator()
+
+
+def subject(count=3, held_back=None, others=None, options=OPTIONS, name='rope'):
+    held = tuple(range(count)) if held_back is None else held_back
+    return Subject(name, Observed(tuple(toy_trials(count)), options), held, others)
+
+
+def task(left_out=None, search='random', seed=1, engine='toy', **about):
+    return Task(subject(**about), search, seed, engine, left_out)
+
+
+def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back():
+    found = list(tasks([subject(name='a'), subject(held_back=(1,), name='b')], ['random', 'sequential'], 2, 7,
+                       {'a': 'x', 'b': 'y'}))
+    assert [(one.subject.name, one.search, one.left_out) for one in found if one.seed == 7] == [
+        ('a', 'random', None), ('a', 'random', 0), ('a', 'random', 1), ('a', 'random', 2),
+        ('a', 'sequential', None), ('a', 'sequential', 0), ('a', 'sequential', 1), ('a', 'sequential', 2),
+        ('b', 'random', None), ('b', 'random', 1), ('b', 'sequential', None), ('b', 'sequential', 1)]
+    assert [one.seed for one in found] == [7] * 12 + [8] * 12
+    assert {one.engine for one in found if one.subject.name == 'b'} == {'y'}
+    assert [trial.name for trial in found[2].trials] == ['trial 1', 'trial 3']
+    assert [trial.name for trial in found[2].judges.trials] == ['trial 2']
+    assert found[0].judges.trials == ()
+
+
+def test_one_calibration_finds_what_the_library_finds():
+    done = perform(task(search='least_squares', seed=3), toy)
+    trials = toy_trials(3)
+    search = SEARCHES['least_squares'](4, 3, hints(trials, OPTIONS))
+    result = calibrate(trials, OPTIONS.space, ToySimulator(), search, budget=40)
+    assert done.values == result.values
+    assert (done.score, done.error) == (result.best.score, result.errors.mean)
+    assert (done.evaluations, done.simulations) == (len(result.evaluations), result.simulations)
+    assert done.values == pytest.approx(TRUTH, abs=0.5)
+    assert done.judgements == ()
+
+
+def test_what_is_found_is_judged_by_the_trial_that_was_left_out():
+    one = task(left_out=1)
+    done = perform(one, toy)
+    judged, = done.judgements
+    (trial, chains), = judged_chains(one, done, toy)
+    distances = np.linalg.norm(chains - trial.goals[0].chain.points, axis=2)
+    assert trial.name == judged.trial == 'trial 2'
+    assert judged.error == pytest.approx(distances.mean())
+    assert judged.share == pytest.approx(100 * distances.mean() / trial.initial.length)
+
+
+def test_what_is_judged_by_has_no_part_in_what_is_found():
+    trials = list(toy_trials(3))
+    other = trials[1]
+    goal = replace(other.goals[0], chain=replace(other.goals[0].chain,
+                                                 points=other.goals[0].chain.points + [0, 0, 0.05]))
+    trials[1] = Trial(other.name, other.initial, other.actions, (goal,))
+    changed = Task(Subject('rope', Observed(tuple(trials), OPTIONS), (1,)), 'least_squares', 1, 'toy', 1)
+    honest = task(left_out=1, search='least_squares')
+    one, two = perform(honest, toy), perform(changed, toy)
+    assert one.values == two.values
+    assert two.judgements[0].error == pytest.approx(0.05, rel=0.02)
+    assert one.judgements[0].error < 0.001
+
+
+def test_other_trials_judge_where_there_are_some():
+    others = Observed(tuple(toy_trials(5)[3:]), OPTIONS)
+    done = perform(task(search='least_squares', held_back=(), others=others), toy)
+    assert [one.trial for one in done.judgements] == ['trial 4', 'trial 5']
+    assert max(one.error for one in done.judgements) < 0.001
+
+
+def test_a_parameter_without_effect_is_told():
+    options = Options.of({'evaluations': 10, 'calibrate': ['flexibility', 'damping']})
+    done = perform(task(options=options, search='least_squares'), toy)
+    assert done.excited == ('flexibility',)
+    assert done.values['damping'] == 50.0
+
+
+def test_a_calibration_that_cannot_be_simulated_is_an_outcome():
+    done = perform(task(), lambda options: ToySimulator(fail_below=101.0))
+    assert 'diverged' in done.failure
+    assert done.values == {}
+
+
+def test_a_judge_that_cannot_be_simulated_has_no_score():
+    others = Observed(tuple(toy_trials(2)), Options.of({'table': False}))
+    judged = perform(task(held_back=(), others=others),
+                     lambda options: ToySimulator(fail_below=-1.0 if options.table else 101.0))
+    assert judged.judgements == tuple(Judgement(f'trial {k}', None, None, None) for k in (1, 2))
+
+
+def test_a_stopped_calibration_is_none():
+    with pytest.raises(CancelledError):
+        perform(task(), toy, lambda: True)
+
+
+@pytest.mark.parametrize('other', [
+    task(seed=2), task(search='sequential'), task(left_out=0), task(engine='bullet'), task(count=4),
+    task(options=Options.of({'evaluations': 41})), task(options=Options.of({'evaluations': 40, 'mass': 0.1})),
+    task(held_back=(), others=Observed(tuple(toy_trials(1)), OPTIONS)),
+], ids=['seed', 'search', 'trials', 'engine', 'session', 'budget', 'mass', 'judges'])
+def test_whatever_changes_the_outcome_changes_the_key(other):
+    assert other.key != task().key
+
+
+def test_what_does_not_change_the_outcome_keeps_the_key():
+    options = Options.of({'evaluations': 40, 'workers': 7, 'output_directory': 'x', 'record': False})
+    assert task(options=options, name='other name', held_back=(0,)).key == task().key
+
+
+OUTCOME = Outcome({'friction': 0.1 + 0.2}, ('friction',), 1.5, 0.01, 40, 120, 0.5,
+                  (Judgement('trial 1', 3.25, 1 / 3, 2.0), Judgement('trial 2', None, None, None)))
+
+
+def test_the_journal_gives_back_every_digit(tmp_path):
+    Journal(tmp_path / 'x').add(task(), OUTCOME)
+    assert Journal(tmp_path / 'x').find(task()) == OUTCOME
+    assert Journal(tmp_path / 'x').find(task(seed=2)) is None
+
+
+@pytest.mark.parametrize('rest', ['{"key": "a", "outc', '[1]', '{"key": "a"}', '{"key": "a", "outcome": {}}',
+                                  '{"key": "a", "outcome": 3}', '\0\0', 'null\n'])
+def test_lines_that_are_none_do_not_count_and_spoil_nothing(tmp_path, rest):
+    path = tmp_path / 'x'
+    Journal(path).add(task(), OUTCOME)
+    path.write_text(path.read_text() + rest)
+    journal = Journal(path)
+    assert journal.find(task()) == OUTCOME
+    journal.add(task(seed=2), OUTCOME)
+    journal.add(task(seed=3), OUTCOME)
+    again = Journal(path)
+    assert [again.find(task(seed=seed)) for seed in (1, 2, 3, 4)] == [OUTCOME] * 3 + [None]
+
+
+def test_the_journal_says_what_a_line_is_of(tmp_path):
+    Journal(tmp_path / 'x').add(task(left_out=1, search='sequential', seed=5), OUTCOME)
+    entry = json.loads((tmp_path / 'x').read_text())
+    assert (entry['object'], entry['search'], entry['seed'], entry['left_out'], entry['engine']) == (
+        'rope', 'sequential', 5, 2, 'toy')
+
+
+def test_a_journal_that_cannot_be_read_or_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match='--output'):
+        Journal(tmp_path)
+    with pytest.raises(InputError, match='--output'):
+        Journal(tmp_path / 'nowhere' / 'x').add(task(), OUTCOME)
+
+
+@pytest.mark.parametrize(('count', 'held_back', 'said'), [
+    (3, (3,), '--held-back: got 4, expected 1 to 3'), (3, (-1,), '--held-back: got 0'),
+    (1, (0,), 'got one trial')])
+def test_what_cannot_be_held_back_is_refused(count, held_back, said):
+    with pytest.raises(InputError, match=said):
+        subject(count, held_back)

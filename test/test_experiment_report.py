@@ -1,0 +1,127 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The report of an experiment: what its tables say, and that they can be read again."""
+
+import csv
+from dataclasses import replace
+from io import StringIO
+
+import numpy as np
+from PIL import Image
+import pytest
+from test_experiment_summary import run
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.experiment_report import (
+    Account,
+    consistency_csv,
+    document,
+    markdown,
+    runs_csv,
+    scatter_picture,
+    validity_csv,
+)
+from dlo_calibration.experiment_summary import summary
+
+DONE = [*run(1, 60.0, (10.0, 50.0)), *run(2, 70.0, (40.0, 80.0)), *run(3, 80.0, (20.0, 40.0))]
+FINDINGS = summary(DONE)
+ACCOUNT = Account((FINDINGS,), 'the command', 'toy', 3, 150, samples=False, complete=True)
+
+
+def cells(text, first):
+    """Return the rows of a Markdown table that begin with a cell."""
+    rows = [[cell.strip() for cell in line.strip('|').split('|')]
+            for line in text.splitlines() if line.startswith('|')]
+    return [row for row in rows if row[0] == first]
+
+
+def table(text):
+    return list(csv.DictReader(StringIO(text)))
+
+
+def test_consistency_has_an_average_and_a_deviation_for_each_parameter():
+    text = markdown(ACCOUNT)
+    average, *_ = cells(text, 'rope')
+    assert average == ['rope', 'average', '70.0', '*25.0*']  # nothing told its elasticity
+    assert cells(text, '')[0] == ['', 'standard deviation', '10.00', '*0.00*']
+
+
+def test_a_parameter_that_some_runs_told_says_so():
+    some = replace(FINDINGS, informed={'friction': 3, 'elasticity': 1})
+    average, *_ = cells(markdown(replace(ACCOUNT, findings=(some,))), 'rope')
+    assert average[3] == '25.0 *(in 1 of 3 runs)*'
+
+
+def test_validity_has_score_and_error_and_marks_the_very_similar():
+    text = markdown(ACCOUNT)
+    _, row, actions = cells(text, 'rope')
+    assert row == ['rope', 'random', '**40.0**', '17.32', '2 of 3 runs', '80.0', '40.00', '17.32', '4.00',
+                   '2.00', '102', '1.0']
+    assert actions == ['rope', 'random', '23.3 ± 15.3', '56.7 ± 20.8']
+    worse = replace(FINDINGS, score=replace(FINDINGS.score, mean=50.0))
+    assert cells(markdown(replace(ACCOUNT, findings=(worse,))), 'rope')[1][2] == '50.0'
+    assert 'Not complete' not in text
+    assert 'the command' in text
+
+
+def test_the_papers_figures_stand_beside_the_samples_only():
+    fifth = replace(FINDINGS, subject='object5')
+    account = replace(ACCOUNT, findings=(replace(FINDINGS, subject='object1'), fifth), samples=True)
+    text = markdown(account)
+    assert cells(text, 'object5')[1][-1] == '53'
+    assert cells(text, 'object1')[1][-1] == 'not known to us'
+    assert document(account)['paper']['validity'] == {'object5': 53.0}
+    text = markdown(replace(account, samples=False))
+    assert 'paper' not in text
+    assert document(replace(account, samples=False))['paper'] is None
+
+
+def test_failures_and_what_is_missing_are_told():
+    failed = replace(FINDINGS, failures=4)
+    text = markdown(replace(ACCOUNT, findings=(failed,), complete=False))
+    assert cells(text, 'rope')[1][-1] == '4'
+    assert 'Not complete' in text
+
+
+def test_csv_files_have_the_same_numbers():
+    friction, elasticity = table(consistency_csv(ACCOUNT))
+    assert friction['parameter'] == 'friction'
+    assert (float(friction['mean']), float(friction['std'])) == (70.0, 10.0)
+    assert elasticity['runs_that_told_anything'] == '0'
+    whole, first, second = table(validity_csv(ACCOUNT))
+    assert (whole['action'], float(whole['score_mean_cm'])) == ('all', pytest.approx(40.0))
+    assert (first['action'], second['action']) == ('trial 1', 'trial 2')
+    assert float(second['score_mean_cm']) == pytest.approx(170 / 3)
+    rows = table(runs_csv(DONE))
+    assert [row['left_out_trial'] for row in rows] == ['', '1', '2'] * 3
+    assert [float(row['friction']) for row in rows[::3]] == [60.0, 70.0, 80.0]
+    assert rows[1]['held_back_scores_cm'] == '10.0'
+
+
+def test_the_scatter_shows_what_was_told_in_colour(tmp_path):
+    scatter_picture([DONE], tmp_path / 'a.png')
+    nothing = [(task, replace(outcome, excited=())) for task, outcome in DONE]
+    scatter_picture([nothing], tmp_path / 'b.png')
+
+    def blue(path):
+        image = np.asarray(Image.open(path).convert('RGB')).astype(int)
+        return (np.abs(image - (31, 119, 180)).sum(axis=2) < 90).sum()
+
+    assert blue(tmp_path / 'a.png') > 2 * blue(tmp_path / 'b.png') > 0  # the legend has one, too
+
+
+def test_a_picture_that_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match='--output'):
+        scatter_picture([DONE], tmp_path / 'nowhere' / 'a.png')

@@ -1,0 +1,84 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The summary of an experiment: its numbers are those of known outcomes."""
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials
+
+from dlo_calibration.config import Options
+from dlo_calibration.experiment import Judgement, Observed, Outcome, Subject, Task
+from dlo_calibration.experiment_summary import Spread, summary
+
+OPTIONS = Options.of({'calibrate': ['friction', 'elasticity']})
+ROPE = Subject('rope', Observed(tuple(toy_trials(2)), OPTIONS), (0, 1))
+
+
+def run(seed, friction, scores, told=('friction',), seconds=1.0):
+    """Return the three calibrations of a run: on all trials, and without each of the two."""
+    values = {'friction': friction, 'elasticity': 25.0}
+    whole = Outcome(values, told, 5.0, 0.002, 100 + seed, 300, seconds)
+    rest = [Outcome(values, told, 5.0, 0.002, 100, 300, seconds, (Judgement(
+        f'trial {k + 1}', score, None if score is None else score / 1000,
+        None if score is None else score / 10),)) for k, score in enumerate(scores)]
+    return [(Task(ROPE, 'random', seed, 'toy', left_out), outcome)
+            for left_out, outcome in zip((None, 0, 1), (whole, *rest), strict=True)]
+
+
+def test_the_numbers_are_those_of_the_runs():
+    found = summary([*run(1, 60.0, (10.0, 50.0)), *run(2, 70.0, (40.0, 80.0)), *run(3, 80.0, (20.0, 40.0))])
+    assert (found.subject, found.search, found.runs, found.failures) == ('rope', 'random', 3, 0)
+    assert found.parameters['friction'] == Spread(70.0, 10.0, 3)
+    assert found.parameters['elasticity'] == Spread(25.0, 0.0, 3)
+    assert found.informed == {'friction': 3, 'elasticity': 0}
+    # The scores of the runs are 30, 60 and 30.
+    assert found.score.mean == pytest.approx(40.0)
+    assert found.score.std == pytest.approx(np.sqrt(300))
+    assert found.very_similar == 2
+    assert found.error.mean == pytest.approx(0.04)
+    assert found.share.mean == pytest.approx(4.0)
+    assert found.actions['trial 2'].mean == pytest.approx((50 + 80 + 40) / 3)
+    assert found.worst == 80.0
+    assert found.evaluations == Spread(102.0, 1.0, 3)
+    assert found.fitted.mean == pytest.approx(0.002)
+
+
+def test_a_parameter_may_be_told_in_some_runs_only():
+    found = summary([*run(1, 60.0, (1.0, 1.0), ('friction', 'elasticity')), *run(2, 70.0, (1.0, 1.0))])
+    assert found.informed == {'friction': 2, 'elasticity': 1}
+
+
+def test_an_unfinished_run_does_not_count():
+    found = summary([*run(1, 60.0, (10.0, 50.0)), *run(2, 90.0, (40.0, 80.0))[:2]])
+    assert found.runs == 1
+    assert found.parameters['friction'] == Spread(60.0, None, 1)
+
+
+def test_failures_are_counted_and_left_out_of_the_means():
+    second = run(2, 70.0, (None, 30.0))
+    second[0] = (second[0][0], Outcome({}, failure='diverged'))
+    found = summary([*run(1, 60.0, (10.0, 50.0)), *second])
+    assert found.failures == 2
+    assert found.parameters['friction'] == Spread(60.0, None, 1)
+    assert found.score == Spread(30.0, 0.0, 2)
+    assert found.actions['trial 1'].count == 1
+
+
+def test_without_judges_there_is_no_validity():
+    alone = Subject('rope', ROPE.observed, ())
+    outcome = Outcome({'friction': 1.0, 'elasticity': 2.0}, ('friction',), 5.0, 0.002, 10, 20, 1.0)
+    found = summary([(Task(alone, 'random', seed, 'toy'), outcome) for seed in (1, 2)])
+    assert (found.score, found.error, found.worst, found.actions) == (None, None, None, {})
+    assert found.parameters['friction'] == Spread(1.0, 0.0, 2)

@@ -1,0 +1,272 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verb `experiment`: what it writes and prints, and that it goes on where it was killed."""
+
+import csv
+import functools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+from PIL import Image
+from processes import children
+import pytest
+from toy_calibrator import make_toy
+from toy_messages import session_messages, TRUTH, write_session
+
+from dlo_calibration import cli
+from dlo_calibration.messages import bag_types
+from dlo_calibration.samples import samples
+
+PATIENCE = 60.0
+SMALL = ('--runs', 2, '--search', 'random', '--evaluations', 6)
+FILES = {'calibrations.jsonl', 'calibrations.csv', 'consistency.csv', 'validity.csv', 'experiment.json',
+         'experiment.md', 'parameters.png', 'rope_random.png', 'rope_least_squares.png'}
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Give a session of three trials, whose recorded search an experiment does not take."""
+    return write_session(tmp_path / 'rope', session_messages(bag_types(), 3),
+                         {'evaluations': 3, 'workers': 1, 'seed': 9, 'mass': 0.1})
+
+
+@pytest.fixture
+def run(capsys):
+    """Give a function that returns exit code, stdout and stderr of the verb with the toy, in one process."""
+    def run(*words, workers=1):
+        try:
+            code = cli.main(['experiment', *map(str, words), '--workers', str(workers)],
+                            functools.partial(make_toy, 0.0))
+        except SystemExit as end:  # argparse
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Draw no pictures, which take longer than all the rest."""
+    monkeypatch.setattr('dlo_calibration.experiment_verb.session_picture', lambda *_: None)
+    monkeypatch.setattr('dlo_calibration.experiment_report.scatter_picture', lambda *_: None)
+
+
+def timeless(text):
+    """Return a JSON document without how long anything lasted."""
+    found = json.loads(text)
+    for one in found['findings']:
+        one.pop('seconds')
+    return found
+
+
+def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
+    code, output, errors = run(session, '--runs', 2, '--search', 'random', 'least_squares',
+                               '--evaluations', 12, '--output', tmp_path / 'out')
+    assert code == 0
+    assert {file.name for file in (tmp_path / 'out').iterdir()} == FILES
+    assert output == (tmp_path / 'out' / 'experiment.md').read_text()
+    assert f'are in {tmp_path / "out"}' in errors
+    command = re.search('`(dlo-calibration experiment .*)`', output)[1]
+    for word in (str(session), '--runs 2', 'random,least_squares', '--evaluations 12'):
+        assert word in command
+    with (tmp_path / 'out' / 'calibrations.csv').open(newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 2 * 2 * 4
+    assert {row['seed'] for row in rows} == {'1', '2'}  # not the recorded one
+    assert {row['evaluations'] for row in rows if row['search'] == 'random'} == {'12'}
+    for name in FILES:
+        if name.endswith('.png'):
+            assert min(Image.open(tmp_path / 'out' / name).size) > 300
+
+
+def test_the_json_document_is_the_file_and_tells_the_truth_that_was_found(run, session, tmp_path, undrawn):
+    code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--json',
+                          '--output', tmp_path / 'out')
+    found = json.loads(output)
+    assert code == 0
+    assert found == json.loads((tmp_path / 'out' / 'experiment.json').read_text())
+    assert found['complete']
+    one, = found['findings']
+    means = {name: spread['mean'] for name, spread in one['parameters'].items()}
+    assert means == pytest.approx(TRUTH, abs=0.5)
+    assert one['score']['mean'] < 1
+    assert one['very_similar'] == 2
+    assert set(one['actions']) == {'trial 1', 'trial 2', 'trial 3'}
+
+
+def test_the_numbers_are_the_same_for_any_number_of_processes(run, session, tmp_path, undrawn):
+    one = run(session, *SMALL, '--json', '--output', tmp_path / 'one')[1]
+    two = run(session, *SMALL, '--json', '--output', tmp_path / 'two', workers=2)[1]
+    first, second = timeless(one), timeless(two)
+    assert first.pop('command') != second.pop('command')  # it names the processes
+    assert first == second
+
+
+def test_what_is_done_is_not_done_again_and_more_runs_come_on_top(run, session, tmp_path, undrawn):
+    out, journal = tmp_path / 'out', tmp_path / 'out' / 'calibrations.jsonl'
+    run(session, *SMALL, '--output', out)
+    before = journal.read_bytes()
+    code, _, errors = run(session, *SMALL, '--output', out)
+    assert (code, journal.read_bytes()) == (0, before)
+    assert 'done already' not in errors  # there is nothing to do at all
+    _, _, errors = run(session, '--runs', 3, *SMALL[2:], '--output', out)
+    assert '8 of 12 calibrations are done already' in errors
+    assert journal.read_bytes().startswith(before)
+    assert len(journal.read_bytes().splitlines()) == 12
+
+
+def test_another_session_or_option_in_the_same_folder_is_not_mixed_up(run, session, tmp_path, undrawn):
+    other = write_session(tmp_path / 'other' / 'rope', session_messages(bag_types(), 3, first=2),
+                          {'mass': 0.1})
+    out, fresh = tmp_path / 'out', tmp_path / 'fresh'
+    run(session, *SMALL, '--output', out)
+    for words in ((other, *SMALL), (session, *SMALL, '--mass', 0.2), (session, *SMALL, '--seed', 5)):
+        mixed = timeless(run(*words, '--json', '--output', out)[1])
+        assert mixed == timeless(run(*words, '--json', '--output', fresh)[1])
+        for file in fresh.iterdir():
+            file.unlink()
+
+
+def test_chosen_trials_are_held_back(run, session, tmp_path, undrawn):
+    found = json.loads(run(session, *SMALL, '--held-back', 2, '--json', '--output', tmp_path / 'out')[1])
+    assert [list(one['actions']) for one in found['findings']] == [['trial 2']]
+    assert '--held-back 2' in found['command']
+
+
+def test_another_session_may_judge(run, session, tmp_path, undrawn):
+    other = write_session(tmp_path / 'other', session_messages(bag_types(), 2, first=3), {'seed': 3})
+    code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--validate-on', other, '--json',
+                          '--output', tmp_path / 'out')
+    one, = json.loads(output)['findings']
+    assert code == 0
+    assert list(one['actions']) == ['trial 1', 'trial 2']  # of the other session
+    assert one['score']['mean'] < 1
+    assert len((tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()) == 2
+
+
+def test_sessions_of_one_name_stay_apart(run, session, tmp_path):
+    other = write_session(tmp_path / 'other' / 'rope', session_messages(bag_types(), 3, first=2))
+    found = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',
+                           '--output', tmp_path / 'out')[1])
+    assert [one['subject'] for one in found['findings']] == ['rope', 'rope_2']
+    assert (tmp_path / 'out' / 'rope_2_random.png').exists()
+
+
+def test_the_samples_are_the_default():
+    assert sorted(path.name for path in samples().glob('object*')) == [f'object{k}' for k in range(1, 6)]
+
+
+PROGRAM = """
+import functools
+import sys
+from toy_calibrator import make_toy
+from dlo_calibration import cli
+
+if __name__ == '__main__':
+    sys.exit(cli.main(sys.argv[2:], functools.partial(make_toy, float(sys.argv[1]))))
+"""
+
+
+def started(session, out, workers):
+    """Start the verb in a process of its own; return it when it has written down something."""
+    process = subprocess.Popen(
+        [sys.executable, '-c', PROGRAM, '0.01', 'experiment', str(session), *map(str, SMALL), '--json',
+         '--workers', str(workers), '--output', str(out)],
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    begun = time.monotonic()
+    while not (out / 'calibrations.jsonl').exists():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() - begun < PATIENCE
+        time.sleep(0.01)
+    return process
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, workers, undrawn):
+    out = tmp_path / 'out'
+    process = started(session, out, workers)
+    begun = children(process.pid)
+    process.kill()
+    process.communicate()
+    before = (out / 'calibrations.jsonl').read_bytes()
+    assert len(before.splitlines()) < 8
+    assert 'experiment.md' not in {file.name for file in out.iterdir()}
+    code, output, errors = run(session, *SMALL, '--json', '--output', out)
+    assert code == 0
+    assert re.search(r'^\d+ of 8 calibrations are done already$', errors, re.MULTILINE)
+    assert (out / 'calibrations.jsonl').read_bytes().startswith(before)
+    assert timeless(output) == timeless(run(session, *SMALL, '--json', '--output', tmp_path / 'whole')[1])
+    ends = time.monotonic() + PATIENCE
+    while any(os.path.exists(f'/proc/{pid}') for pid in begun):
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers):
+    process = started(session, tmp_path / 'out', workers)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130, errors
+    assert 'Traceback' not in errors
+    assert 'interrupted' in errors
+    done = (tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()
+    assert 1 <= len(done) < 8
+    assert all(json.loads(line)['outcome']['values'] for line in done)
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (('nowhere',), 'nowhere'),
+    (('{session}', '--runs', '0'), '--runs: got 0'),
+    (('{session}', '--search', 'guess'), "parameter search: got 'guess'"),
+    (('{session}', '--search', ','), '--search: got no name'),
+    (('{session}', '--held-back', '4'), '--held-back: got 4, expected 1 to 3'),
+    (('{session}', '--held-back', 'x'), '--held-back'),
+    (('{session}', '--held-back', '1', '--validate-on', '{session}'), 'not allowed with'),
+    (('{session}', '--validate-on', '{session}', '{session}'), '--validate-on: got 2 session(s)'),
+    (('{session}', '--mass', '-1'), 'parameter mass'),
+    (('{session}', '--output', '{session}/metadata.yaml'), '--output'),
+    (('{session}', '--record'), '--record'),
+], ids=lambda one: one if isinstance(one, str) else None)
+def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
+    code, output, errors = run(*(word.format(session=session) for word in words))
+    assert (code, output) == (2, '')
+    assert said in errors.splitlines()[-1]
+    assert len(errors.splitlines()) == 1
+
+
+def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path):
+    short = write_session(tmp_path / 'short', session_messages(bag_types(), 1))
+    code, _, errors = run(short, '--output', tmp_path / 'out')
+    assert code == 2
+    assert '--validate-on' in errors
+    other = write_session(tmp_path / 'other', session_messages(bag_types(), 1, first=1))
+    assert run(short, '--validate-on', other, '--runs', 1, '--evaluations', 3, '--search', 'random',
+               '--output', tmp_path / 'out')[0] == 0
+
+
+def test_what_fails_everywhere_is_told_in_the_table(session, tmp_path, capsys):
+    from toy_simulator import ToySimulator
+    code = cli.main(['experiment', str(session), '--runs', '1', '--search', 'random', '--evaluations', '3',
+                     '--workers', '1', '--output', str(tmp_path / 'out')],
+                    lambda options: ToySimulator(fail_below=101.0))
+    assert code == 0
+    assert '| 4 |' in capsys.readouterr().out
