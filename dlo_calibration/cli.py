@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
-import shlex
 import shutil
 import sys
 import time
@@ -41,7 +40,7 @@ from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.trial import Trial
-from dlo_calibration.worker import calibrate_with, confirmed_with, SimulatorFactory
+from dlo_calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 
 PROGRAM = 'dlo-calibration'
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' convention
@@ -238,7 +237,7 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                 raise KeyboardInterrupt from None
         try:
             if folder is not None:
-                _write(folder, chosen.session, found, result)
+                _write(folder, chosen.session, found, result, make_simulator, stop)
                 _note(f'{", ".join(_files(chosen.session))} are in {folder}')
         finally:  # a disk that is full by now must not lose what was found
             _print_result(result, chosen.json, told)
@@ -376,26 +375,28 @@ def _make_folder(folder: Path, names: Sequence[str]) -> None:
                          'choose another one with --output') from error
 
 
-def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult) -> None:
+def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult,
+           make_simulator: SimulatorFactory, should_stop: Callable[[], bool]) -> None:
     """Write the files of `fit`."""
-    from dlo_calibration.report import write_evaluations, write_report
+    from dlo_calibration.report import digests, Origin, repeating_command, write_evaluations, write_report
 
     write_result(folder / RESULT, result, found.options.flat())
     _write_session(folder / SESSION, source, found)
     if _is_request(source):
         _copy(source, folder / REQUEST)
     write_evaluations(folder / EVALUATIONS, result)
-    flags = [flag for name, value in found.options.flat().items() if value != Options().flat()[name]
-             for flag in _as_flags(name, value)]
-    command = shlex.join([PROGRAM, 'fit', REQUEST if _is_request(source) else SESSION, *flags])
-    write_report(folder / REPORT, result, command, [*found.session.problems, *found.refusals])
+    repeated = REQUEST if _is_request(source) else SESSION
+    origin = Origin(source.name, repeating_command(repeated, found.options), found.options,
+                    digests([*_recorded(source), folder / repeated]),
+                    [*found.session.problems, *found.refusals])
+    slices = sliced_with(result, found.options, make_simulator, should_stop)
+    write_report(folder / REPORT, result, origin, slices)
 
 
-def _as_flags(name: str, value: Any) -> list[str]:
-    flag = f'--{name.replace("_", "-")}'
-    if isinstance(value, bool):
-        return [flag if value else f'--no-{flag[2:]}']
-    return [flag, ','.join(value) if isinstance(value, list) else str(value)]
+def _recorded(source: Path) -> list[Path]:
+    """List the files that hold the messages of a session."""
+    return [source] if source.is_file() else sorted(path for path in source.iterdir()
+                                                    if path.suffix in ('.mcap', '.db3', '.zstd'))
 
 
 def _write_session(path: Path, source: Path, found: _Input) -> None:

@@ -17,6 +17,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
 from dlo_calibration import findings
@@ -40,17 +41,20 @@ WHOLE = 'calibration'  # name of the status that speaks of the whole result
 
 
 def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: Evaluation, evaluations: int,
-             simulations_per_second: float, seconds_left: float) -> Any:
+             simulations_per_second: float, seconds_left: float,
+             spread: Mapping[str, float] = MappingProxyType({})) -> Any:
     """
     Build the message about one finished evaluation.
 
     :param evaluation: the one that has finished; counted from 1 in the message.
     :param best: the best so far.
     :param evaluations: how many there will be.
+    :param spread: of each parameter over the best evaluations so far (0..100), see `worker.Progress`.
     """
     values: dict[str, Any] = {
         'evaluation': evaluation.index + 1, 'evaluations': evaluations, 'score': evaluation.score,
         'best_score': best.score, **{f'best_{name}': value for name, value in best.values.items()},
+        **{f'spread_{name}': value for name, value in spread.items()},
         'simulations_per_second': simulations_per_second, 'seconds_left': seconds_left}
     if evaluation.failure:
         values['failure'] = evaluation.failure
@@ -97,7 +101,7 @@ def _examination(found: CalibrationResult) -> dict[str, Any]:
     lengths = {f'{key.removesuffix("_m")}_mm': '' if examined[key] is None else 1e3 * examined[key]
                for key in ('cross_validated_error_m', 'default_error_m', 'noise_m', 'residual_std_m')}
     return {**lengths, 'undetermined': '; '.join(found.undetermined),
-            'findings': '; '.join(findings.sentences(found))}
+            'findings': ' '.join(findings.sentences(found))}
 
 
 def _confirmation(found: Confirmation | None) -> dict[str, Any]:

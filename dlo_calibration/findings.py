@@ -23,15 +23,41 @@ import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.gain import silent
-from dlo_calibration.parameters import SCALE
-from dlo_calibration.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
+from dlo_calibration.parameters import BY_NAME, PER_WEIGHT, SCALE
+from dlo_calibration.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 
 MEAN_DISTANCE = float(np.sqrt(8 / np.pi))  # of white noise in three coordinates, in its standard deviations
 
 
 def sentences(result: CalibrationResult) -> list[str]:
-    """Return what the trials could not tell, what would tell it, and how far to trust the fit."""
-    return [*_verdicts(result), *_open(result), *_silent(result), *_advice(result), *_check(result)]
+    """Return what is known, how well, what is not, what would tell it, and how far to trust the fit."""
+    return [*_known(result), *_open(result), *_silent(result), *_advice(result), *_fit(result)]
+
+
+def physical_text(value: float, unit: str) -> str:
+    """Return a physical value with its unit as people write it; lengths in mm."""
+    shown, unit = _shown([value], unit)
+    return f'{shown[0]}{unit}'
+
+
+def interval_text(lower: float, upper: float, unit: str) -> str:
+    """Return a physical interval with its unit as people write it."""
+    shown, unit = _shown([lower, upper], unit)
+    return f'{" to ".join(shown)}{unit}'
+
+
+def _shown(values: list[float], unit: str) -> tuple[list[str], str]:
+    """Return the texts of values, and what to write after them."""
+    if unit == 'm':
+        return [plain(1e3 * value) for value in values], ' mm'
+    return [plain(value) for value in values], '' if unit == '1' else f' {unit}'
+
+
+def plain(value: float) -> str:
+    """Return a number with three digits that count; with a power of ten only where it is very large."""
+    if value == 0 or 1e-6 <= abs(value) < 1e6:
+        return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
+    return f'{value:.2e}'
 
 
 def values(result: CalibrationResult) -> dict[str, Any]:
@@ -55,47 +81,68 @@ def values(result: CalibrationResult) -> dict[str, Any]:
         'correlations': correlations, 'undetermined': list(result.undetermined), 'advice': advice}
 
 
-def _verdicts(result: CalibrationResult) -> list[str]:
-    found = []
-    for verdict, words in ((NOT_IDENTIFIABLE, 'not identifiable from these trials'),
-                           (WEAK, 'only roughly known from these trials')):
-        names = [name + (f' ({p.note})' if p.note else '') for name, p in result.parameters.items()
-                 if (p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)) == verdict]
-        if names:
-            found.append(f'{words}: {", ".join(names)}')
-    ends = [name for name, p in result.parameters.items() if p.verdict == IDENTIFIABLE and p.note]
-    if ends:
-        found.append(f'at the end of the scale, so that the best value may lie beyond: {", ".join(ends)}')
-    if found and result.examination is not None and not result.examination.regular:
-        found.append('the search had not arrived at a minimum; intervals are the spread of its best '
-                     'evaluations, and more evaluations or another search may narrow them')
-    return found
+def _known(result: CalibrationResult) -> list[str]:
+    """Say of each parameter what it is, those known best first."""
+    found: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
+    for name, p in result.parameters.items():
+        verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
+        quantity = BY_NAME[name].quantity
+        value = physical_text(p.physical_value, p.physical_unit)
+        interval = interval_text(p.physical_lower, p.physical_upper, p.physical_unit)
+        if verdict == NOT_IDENTIFIABLE:
+            words = f'{name} could not be told'
+            words += f' ({p.note}): {quantity} {value}' if p.note else \
+                f': with these trials, {quantity} may be anything from {interval}'
+        else:
+            well = 'well' if verdict == IDENTIFIABLE else 'only roughly'
+            words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {interval}'
+            words += f' ({p.note})' if p.note else ''
+        found[verdict].append(f'{words}.')
+    told = [text for group in found.values() for text in group]
+    if any(p.physical_unit.endswith(PER_WEIGHT) for p in result.parameters.values()):
+        told.append('The mass was not given, so that stiffnesses are known only in proportion to the '
+                     'weight of the DLO: each is to be multiplied by the weight per length, in N/m.')
+    if result.examination is not None and not result.examination.regular:
+        told.append('The search had not arrived at a minimum, so that the intervals are only the spread '
+                     'of the best parameter sets it tried; more evaluations or another search may narrow '
+                     'them.')
+    return told
 
 
 def _open(result: CalibrationResult) -> list[str]:
-    return [f'the trials leave open: {words}' for words in result.undetermined]
+    return [f'These can change together while the fit stays nearly the same: {words}.'
+            for words in result.undetermined]
 
 
 def _silent(result: CalibrationResult) -> list[str]:
     names = silent(result) if len(result.trials) > 1 else ()
-    return [f'{", ".join(names)} told nothing: all of it would have been known without'] if names else []
+    return [f'{", ".join(names)} told nothing: all of it would have been known without.'] if names else []
 
 
 def _advice(result: CalibrationResult) -> list[str]:
     one = result.advice
     if one is None:
         return []
-    return [f'to know {one.parameter} better, {one.words} ({one.action}): that would give it to '
-            f'± {one.expected_std * SCALE:.1f} of 100, which is ± {one.std * SCALE:.1f} now']
+    return [f'To know {one.parameter} better, {one.words} (action {one.action}). On the scale from 0 to '
+            f'100, that should bring its standard deviation from {one.std * SCALE:.1f} to '
+            f'{one.expected_std * SCALE:.1f}.']
 
 
-def _check(result: CalibrationResult) -> list[str]:
-    found = result.examination
+def _fit(result: CalibrationResult) -> list[str]:
+    """Say how well it fits, and what that means."""
+    found, mean = result.examination, result.errors.mean
+    words = [f'The simulated points are {mean * 1e3:.2f} mm from the measured ones on average '
+             f'({100 * mean / result.length:.2f} % of the length).']
     if found is None:
-        return []
-    words = [f'{text} {value * 1e3:.2f} mm' for text, value in (
-        ('trials left out of the fit', found.cross_validated), ('default parameters', found.default_error),
-        ('noise of the points alone', found.noise * MEAN_DISTANCE)) if np.isfinite(value)]
-    if not words:
-        return []
-    return [f'mean error {result.errors.mean * 1e3:.2f} mm; for comparison: {", ".join(words)}']
+        return words
+    if np.isfinite(found.default_error):
+        words.append(f'With the default parameters they would be {found.default_error * 1e3:.2f} mm away.')
+    if np.isfinite(found.cross_validated):
+        words.append('A trial that is left out of the fit is predicted to '
+                     f'{found.cross_validated * 1e3:.2f} mm.')
+    noise = found.noise * MEAN_DISTANCE
+    if np.isfinite(noise):
+        words.append(f'The noise of the measured points alone gives {noise * 1e3:.2f} mm; ' + (
+            'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
+            'the rest is what the model, or the recorded path of a hand, does not explain.'))
+    return [' '.join(words)]

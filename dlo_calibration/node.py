@@ -159,7 +159,7 @@ class CalibratorNode(OptionsNode):
         self._make_simulator = make_simulator
         self._worker = Worker(make_simulator)
         self._appraiser = Appraiser(make_simulator)
-        self._recorder = Recorder(self._fail_to_record)
+        self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._calibrating: Options | None = None  # options of the calibration under way
         self._progress = Progress(0, 0)
         self._progress_sent = 0.0
@@ -194,7 +194,7 @@ class CalibratorNode(OptionsNode):
         except (InvalidHandle, RuntimeError) as error:  # the context was shut down by somebody else
             self.get_logger().debug(repr(error))
         finally:
-            self._recorder.end()
+            self._recorder.close()
             self.destroy_node()
 
     def changed(self, names: Sequence[str]) -> None:
@@ -340,6 +340,7 @@ class CalibratorNode(OptionsNode):
         try:
             self._hear_best_effort()
             self._take_events()
+            self._recorder.tell()
             self._start_by_itself()
             self._appraise()
             self._show_new()
@@ -384,7 +385,7 @@ class CalibratorNode(OptionsNode):
         self._send('progress', diagnostics.progress(
             self._types, stamp=self._now(), evaluation=progress.newest, best=progress.best,
             evaluations=progress.evaluations, simulations_per_second=progress.simulations_per_second,
-            seconds_left=progress.seconds_left))
+            seconds_left=progress.seconds_left, spread=progress.spread))
         progress.newest, self._progress_sent = None, time.monotonic()
 
     def _finish(self, event: CalibrationResult | Failure) -> None:

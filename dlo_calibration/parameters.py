@@ -35,6 +35,7 @@ from dlo_calibration.errors import InputError
 SCALE = 100.0
 GRAVITY = 9.81  # m/s^2
 ASSUMED_DENSITY = 0.05  # kg/m, of a DLO whose mass is not known
+PER_WEIGHT = 'per N/m'  # end of the unit of what is divided by the weight per length
 
 
 @dataclass(frozen=True)
@@ -240,5 +241,5 @@ class ParameterSpace:
         parameter = BY_NAME[name]
         physical = parameter.physical(value)
         if parameter.per_weight and not self.mass_known:
-            return physical / (ASSUMED_DENSITY * GRAVITY), f'{parameter.unit} per N/m'
+            return physical / (ASSUMED_DENSITY * GRAVITY), f'{parameter.unit} {PER_WEIGHT}'
         return physical, parameter.unit

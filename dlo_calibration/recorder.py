@@ -26,7 +26,9 @@ from dlo_calibration.config import Options
 from dlo_calibration.description import write_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.recording import RecordingError, SessionWriter
-from dlo_calibration.report import write_evaluations
+from dlo_calibration.report import Origin, repeating_command, write_evaluations
+from dlo_calibration.reporter import Reporter
+from dlo_calibration.worker import SimulatorFactory
 
 
 class Recorder:
@@ -34,10 +36,12 @@ class Recorder:
     Records one session after the other; no method raises because of the disk.
 
     :param on_failure: called with a text, once, when a session cannot be written further.
+    :param make_simulator: for the report of a result.
     """
 
-    def __init__(self, on_failure: Callable[[str], None]) -> None:
+    def __init__(self, on_failure: Callable[[str], None], make_simulator: SimulatorFactory) -> None:
         self._on_failure = on_failure
+        self._reporter = Reporter(make_simulator)
         self._session: SessionWriter | None = None
 
     @property
@@ -64,18 +68,38 @@ class Recorder:
         self._write(lambda session: session.write_mark('start'))
 
     def result(self, result: CalibrationResult, options: Options) -> None:
-        """Write result.xml and evaluations.csv (result_2.xml, ...) into the session's folder."""
+        """
+        Write result.xml and evaluations.csv (result_2.xml, ...) into the session's folder.
+
+        report.html (report_2.html, ...) follows, some seconds later.
+        """
         if self._session is not None:
+            folder = self._session.path
             try:
-                write_result(_free(self._session.path, 'result', '.xml'), result, options.flat())
-                write_evaluations(_free(self._session.path, 'evaluations', '.csv'), result)
+                path = _free(folder, 'result', '.xml')
+                write_result(path, result, options.flat())
+                write_evaluations(_free(folder, 'evaluations', '.csv'), result)
             except InputError as error:
                 self._on_failure(str(error))
+                return
+            origin = Origin(folder.name, repeating_command(folder.name, options), options)
+            self._reporter.begin(folder / path.name.replace('result', 'report').replace('.xml', '.html'),
+                                 result, origin)
+
+    def tell(self) -> None:
+        """Tell why a report could not be written, if one could not since the last time."""
+        for text in self._reporter.failures():
+            self._on_failure(text)
 
     def end(self) -> None:
         """End the session; without one, do nothing."""
         self._write(SessionWriter.close)
         self._session = None
+
+    def close(self) -> None:
+        """End the session, and wait for its report."""
+        self.end()
+        self._reporter.close()
 
     def _write(self, write: Callable[[SessionWriter], None]) -> None:
         if self._session is None:

@@ -17,9 +17,11 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import Counter
 from contextlib import closing, ExitStack
 from dataclasses import dataclass, replace
+import math
 import queue
 import threading
 import time
@@ -34,7 +36,9 @@ from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
+from dlo_calibration.slices import cut, Slices
 from dlo_calibration.trial import Trial
+from dlo_calibration.uncertainty import good_count
 
 GUESSED = 'no trial tells anything about it; guessed from the height at which the DLO lies'
 
@@ -169,6 +173,20 @@ def confirmed_with(result: CalibrationResult, options: Options, make_simulator: 
         return replace(result, warnings=(*result.warnings, f'not confirmed by engine {CONFIRMING}: {text}'))
 
 
+def sliced_with(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
+                should_stop: Callable[[], bool] = lambda: False) -> Slices | None:
+    """
+    Simulate slices around a result, in this thread; None where the engine fails.
+
+    It takes `slices.SECONDS` at most.
+    """
+    try:
+        with closing(make_simulator(options)) as simulator:
+            return cut(result, simulator, should_stop)
+    except Exception:  # whatever the engine does, there is a page
+        return None
+
+
 def _executor(options: Options, on_death: Callable[[str], None],
               on_wait: Callable[[str], None]) -> pool.ProcessExecutor | ClusterExecutor | None:
     """Return where evaluations are simulated; None: here."""
@@ -191,6 +209,7 @@ class Progress:
         self.count = 0
         self.newest: Evaluation | None = None
         self.best: Evaluation | None = None
+        self._good: list[Evaluation] = []  # the best ones, best first
         self._simulations = 0
         self._trials = trials
         self._clock, self._begun = clock, clock()
@@ -202,6 +221,22 @@ class Progress:
         self.newest = evaluation
         if self.best is None or evaluation.score < self.best.score:
             self.best = evaluation
+        if math.isfinite(evaluation.score) and not evaluation.abandoned:
+            insort(self._good, evaluation, key=lambda one: one.score)
+            del self._good[good_count(self.evaluations):]
+
+    @property
+    def spread(self) -> dict[str, float]:
+        """
+        How far the best 5 % of the evaluations so far (8 at least) lie from the best, 0..100, by parameter.
+
+        The root mean square distance, as in `uncertainty.spread_of_best`.
+        """
+        good = self._good[:good_count(self.count)]
+        if self.best is None or not good:
+            return {}
+        return {name: math.sqrt(sum((one.values[name] - value)**2 for one in good) / len(good))
+                for name, value in self.best.values.items()}
 
     @property
     def simulations_per_second(self) -> float:

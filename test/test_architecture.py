@@ -31,7 +31,7 @@ ORDER = (
     'errors', 'samples', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
     'search', 'confirmation', 'uncertainty', 'examination', 'advice', 'calibration', '__init__', 'config',
-    'parameter_file', 'gain', 'findings',
+    'parameter_file', 'gain', 'findings', 'slices',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
     'collector', 'recording', 'xml', 'description',
@@ -40,8 +40,8 @@ ORDER = (
     'rollout', 'contact', 'natural', 'twist', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
     # edges
     'pool', 'cluster', 'worker', 'appraiser', 'experiment', 'experiment_summary', 'picture', 'animation',
-    'plot', 'terminal', 'report', 'experiment_report', 'experiment_verb', 'signals', 'recorder',
-    'options_node', 'node',
+    'plot', 'terminal', 'charts', 'figures', 'report', 'reporter', 'experiment_report', 'experiment_verb',
+    'signals', 'recorder', 'options_node', 'node',
     'calibrator', 'cli', '__main__', 'demo',
 )
 

@@ -28,7 +28,7 @@ from dlo_calibration.confirmation import disagreements
 from dlo_calibration.description import read_result, write_result
 from dlo_calibration.messages import bag_types
 from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.report import write_report
+from dlo_calibration.report import Origin, write_report
 from dlo_calibration.score import PointErrors, residuals, trial_score
 from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.terminal import error_facts
@@ -217,7 +217,7 @@ def test_people_are_told(tmp_path):
     assert dict(error_facts(after))['confirmed by second toy'].endswith(
         'points 4.00 mm from those of toy, 4.00 mm at most')
     assert 'confirmed by second toy' not in dict(error_facts(before))
-    write_report(tmp_path / 'report.html', after, 'fit')
+    write_report(tmp_path / 'report.html', after, Origin('session', 'fit', Options()))
     assert 'confirmed by second toy' in (tmp_path / 'report.html').read_text(encoding='utf-8')
 
 

@@ -192,6 +192,9 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert [repr(score) for score in replayed['scores']] == whole(live)['scores'].split()
     written = read_result(folder / 'result.xml')
     assert written.values == {name: one['value'] for name, one in replayed['parameters'].items()}
+    page = (folder / 'report.html').read_text(encoding='utf-8')  # closing the node has waited for it
+    assert f'dlo-calibration fit {folder.name}' in page
+    assert page.count('aria-label="Seen from above') == 3
     kinds = {record.name for record in read_session(folder).records}
     assert kinds == {*INPUT_TYPES, *OUTPUT_TYPES}
 
@@ -224,6 +227,8 @@ def test_what_comes_after_the_start_is_for_the_next_one(start_node, tmp_path, ca
     assert whole(second)['trials'] == '2'
     assert repr(fitted(folder, capsys)['score']) == whole(second)['score']
     assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_2.xml'}
+    robot.calibrator.close()
+    assert {file.name for file in folder.glob('*.html')} == {'report.html', 'report_2.html'}
 
 
 def test_markers_show_trials_at_once_and_then_what_was_simulated(start_node):

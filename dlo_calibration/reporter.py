@@ -1,0 +1,67 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Reporter: writes the page of a result in a thread of its own, as it takes seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import queue
+import threading
+from typing import Iterator
+
+from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.report import Origin, write_report
+from dlo_calibration.worker import SimulatorFactory, sliced_with
+
+PATIENCE = 10.0  # s that the end waits for a page
+
+
+class Reporter:
+    """
+    Writes pages; nothing that goes wrong there is raised.
+
+    :param make_simulator: called in the thread, for the slices.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory) -> None:
+        self._make_simulator = make_simulator
+        self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def begin(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
+        """Begin to write a page; returns at once."""
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        thread = threading.Thread(target=self._write, args=(path, result, origin), name='report', daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def failures(self) -> Iterator[str]:
+        """Take what went wrong since the last time, as sentences."""
+        while not self._failures.empty():
+            yield self._failures.get_nowait()
+
+    def close(self) -> None:
+        """Simulate no further; wait until the pages are written, or for a while at least."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(PATIENCE)
+
+    def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
+        try:
+            slices = sliced_with(result, origin.options, self._make_simulator, self._stop.is_set)
+            write_report(path, result, origin, slices)
+        except Exception as error:  # a thread that dies silently leaves the user without a page and a reason
+            self._failures.put(f'the report could not be written: {" ".join(str(error).split()) or error!r}')

@@ -1,0 +1,246 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The report is a page that tells what was found, in any browser, and needs nothing else."""
+
+from dataclasses import replace
+import hashlib
+from html import escape, unescape
+from html.parser import HTMLParser
+import math
+from pathlib import Path
+import re
+import shutil
+import subprocess
+
+import numpy as np
+from PIL import Image
+import pytest
+from toy_messages import toy_trials
+from toy_simulator import ToySimulator
+
+from dlo_calibration.advice import Advice
+from dlo_calibration.config import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.report import digests, MOST_TRIALS, Origin, repeating_command, write_report
+from dlo_calibration.slices import cut
+from dlo_calibration.worker import calibrate_with
+
+BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
+QUIET = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+         '--hide-scrollbars', '--disable-background-networking',
+         '--disable-component-update', '--disable-sync')
+OPTIONS = Options.of({'workers': 1, 'evaluations': 60, 'seed': 4, 'mass': 0.03})
+PATIENCE = 120
+WIDTHS = (1280, 390)  # of a desktop and of a phone
+
+
+@pytest.fixture(scope='module')
+def result():
+    """Return what the toy finds from three trials, one of which has a name that HTML must not take."""
+    first, second, third = toy_trials(3)
+    trials = (replace(first, name='<b>first</b> & "only"'), second, third)
+    return calibrate_with(trials, OPTIONS, lambda _: ToySimulator())
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Give a function that writes the page of a result and returns its text."""
+    def page(result, origin=None, slices=None):
+        path = tmp_path / 'report.html'
+        write_report(path, result, origin or Origin('s', 'a command', OPTIONS), slices)
+        return path.read_text(encoding='utf-8')
+
+    return page
+
+
+class Outline(HTMLParser):
+    """What a page consists of: its text, headings, cells, drawings, and what it refers to."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.text, self.headings, self.references, self.drawings, self.open = [], [], [], [], []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.references += [attributes[name] for name in ('src', 'href', 'xlink:href') if name in attributes]
+        if tag == 'svg':
+            self.drawings.append(attributes)
+        if tag not in ('meta', 'br', 'path'):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag, f'</{tag}> closes nothing'
+
+    def handle_data(self, text):
+        if 'style' not in self.open:
+            self.text.append(text)
+            if self.open and re.fullmatch('h[1-6]', self.open[-1]):
+                self.headings.append((self.open[-1], text))
+
+
+def words(page):
+    return ' '.join(' '.join(Outline(page).text).split())
+
+
+def test_every_element_is_closed_and_every_drawing_explained(result, page):
+    outline = Outline(page(result, slices=cut(result, ToySimulator())))
+    assert outline.open == []
+    assert [text for tag, text in outline.headings if tag == 'h1'] == ['Calibration of s']
+    charts = [one for one in outline.drawings if one.get('role') == 'img']
+    assert len(charts) > 4 * len(result.trials)
+    assert all(len(one['aria-label']) > 20 for one in charts)
+    assert all(one.get('aria-hidden') for one in outline.drawings if one not in charts)
+
+
+def test_needs_nothing_but_itself(result, page):
+    text = page(result, slices=cut(result, ToySimulator()))
+    ids = set(re.findall(' id="([^"]+)"', text))
+    for reference in Outline(text).references:
+        assert reference.startswith('#') and reference[1:] in ids
+    assert 'url(' not in text and '@import' not in text and '<script' not in text
+    assert len(text) < 3e6
+
+
+def test_names_are_text_not_html(result, page):
+    text = page(result)
+    assert '<b>first' not in text
+    assert '<b>first</b> & "only"' in words(text)
+
+
+def test_says_what_is_known_in_units(result, page):
+    text = words(page(result))
+    for name, estimate in result.parameters.items():
+        assert f'{name} is known well' in text or f'{name} is known only roughly' in text \
+            or f'{name} could not be told' in text
+        assert f'{estimate.lower:.1f} to {estimate.upper:.1f}' in text
+    assert f'{1e3 * result.errors.mean:.2f} mm' in text
+
+
+def test_says_which_action_would_tell(result, page):
+    advice = Advice('drag', 'drag the middle', 'friction', 0.2, 0.05, 0.3, 0.5)
+    text = words(page(replace(result, advice=advice)))
+    assert 'To know friction better, drag the middle' in text
+    assert 'from 20.0 to 5.0' in text
+
+
+def test_warnings_and_problems_are_shown(result, page):
+    text = words(page(replace(result, warnings=('it never rested',)),
+                      Origin('s', 'c', OPTIONS, problems=('a message was lost',))))
+    assert 'Warnings' in text
+    assert 'it never rested' in text
+    assert 'a message was lost' in text
+
+
+def test_numbers_that_are_not_known_are_left_out(result, page):
+    unknown = replace(result.examination, cross_validated=math.nan, noise=math.nan, default_error=math.nan)
+    for examination in (None, unknown):
+        assert not re.search(r'\b(nan|inf)\b', page(replace(result, examination=examination)))
+
+
+def test_search_shows_what_was_abandoned_and_what_failed(result, page):
+    """Legends tell what there is, and no more."""
+    def searched(**changes):
+        evaluations = [replace(one, scores=(9.0,) * 3, skipped=0, failure='') for one in result.evaluations]
+        evaluations[1] = replace(evaluations[1], **changes)
+        found = replace(result, evaluations=tuple(evaluations))
+        return ' '.join(Outline(page(found, slices=cut(result, ToySimulator()))).text)
+
+    assert not re.search('abandoned early:|could not be simulated', searched())
+    assert 'abandoned early: its score' in searched(scores=(90.0, math.nan, math.nan), skipped=2)
+    assert 'could not be simulated' in searched(scores=(), failure='diverged')
+
+
+def test_slices_are_drawn_or_said_to_be_left_out(result, page):
+    without, drawn = page(result), page(result, slices=cut(result, ToySimulator()))
+    assert 'Left out' in without
+    assert 'Along flexibility' in drawn
+    assert 'Left out' not in drawn
+
+
+def test_of_many_trials_the_worst_are_drawn(page):
+    trials = toy_trials(MOST_TRIALS + 3)
+    result = calibrate_with(trials, replace(OPTIONS, evaluations=20), lambda _: ToySimulator())
+    text = page(result)
+    assert text.count('Seen from above') == 2 * MOST_TRIALS  # the title and its description
+    for trial in trials:
+        assert trial.name in text
+
+
+def test_command_and_options_that_repeat_it(result, page, tmp_path):
+    (tmp_path / 'session.mcap').write_bytes(b'what was heard')
+    command = repeating_command('session.mcap', OPTIONS)
+    assert command == 'dlo-calibration fit session.mcap --mass 0.03 --evaluations 60 --seed 4 --workers 1'
+    text = page(result, Origin('s', command, OPTIONS, digests([tmp_path / 'session.mcap'])))
+    assert command in unescape(text)
+    assert hashlib.sha256(b'what was heard').hexdigest() in text
+    assert f'numpy {np.__version__}' in words(text)
+    assert 'settle_limit' in text
+
+
+def test_page_that_cannot_be_written_is_an_input_error(result, tmp_path):
+    with pytest.raises(InputError, match='--output'):
+        write_report(tmp_path / 'none' / 'report.html', result, Origin('s', 'c', OPTIONS))
+
+
+@pytest.fixture(scope='module')
+def browse(tmp_path_factory):
+    """Give a function that calls a browser with a profile of its own, and returns what it prints."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip(f'none of {", ".join(BROWSERS)} is installed')
+    profile = tmp_path_factory.mktemp('profile')
+
+    def browse(*arguments):
+        done = subprocess.run([browser, *QUIET, f'--user-data-dir={profile}', *map(str, arguments)],
+                              capture_output=True, text=True, timeout=PATIENCE)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return browse
+
+
+def framed(page: str, width: int, height: int) -> str:
+    """Return a page that shows another one in a frame, as no window is narrower than 500, and measures it."""
+    measure = ("let seen = this.contentDocument.documentElement; "
+               "document.body.append('measured ' + seen.scrollWidth + ' ' + seen.scrollHeight)")
+    return (f'<!DOCTYPE html><body style="margin:0"><iframe style="border:0" width="{width}" '
+            f'height="{height}" onload="{measure}" srcdoc="{escape(page)}"></iframe></body>')
+
+
+@pytest.mark.parametrize('width', WIDTHS)
+def test_browser_shows_it_without_scrolling_sideways(result, page, browse, tmp_path, width):
+    text = page(result, slices=cut(result, ToySimulator()))
+    frame, shot = tmp_path / 'frame.html', tmp_path / 'shot.png'
+    frame.write_text(framed(text, width, 1000), encoding='utf-8')
+    across, down = map(int, re.search(r'measured (\d+) (\d+)', browse('--dump-dom', frame.as_uri())).groups())
+    assert across <= width
+    assert down > 3000
+    frame.write_text(framed(text, width, down), encoding='utf-8')
+    browse(f'--screenshot={shot}', f'--window-size={max(width, 600)},{down}', frame.as_uri())
+    seen = np.asarray(Image.open(shot).convert('L'))[:, :width]
+    assert (seen[:, :4] > 250).all() and (seen[:, -2:] > 250).all()  # nothing is cut off at the sides
+    for part in np.array_split(seen, down // 1000):
+        assert (part < 128).mean() > 0.002  # there is something to read everywhere
+
+
+def test_measure_sees_what_is_too_wide(browse, tmp_path):
+    frame = tmp_path / 'frame.html'
+    frame.write_text(framed('<div style="width:700px">wide</div>', 390, 500), encoding='utf-8')
+    assert int(re.search(r'measured (\d+)', browse('--dump-dom', Path(frame).as_uri()))[1]) >= 700

@@ -1,0 +1,76 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reporter writes pages beside everything else, and whatever goes wrong there is told, not raised."""
+
+import threading
+
+import pytest
+from toy_messages import toy_trials
+from toy_simulator import ToySimulator
+
+from dlo_calibration.config import Options
+from dlo_calibration.report import Origin
+from dlo_calibration.reporter import Reporter
+from dlo_calibration.worker import calibrate_with
+
+OPTIONS = Options.of({'workers': 1, 'evaluations': 20})
+ORIGIN = Origin('session', 'a command', OPTIONS)
+
+
+@pytest.fixture(scope='module')
+def result():
+    """Return what the toy finds."""
+    return calibrate_with(toy_trials(2), OPTIONS, lambda _: ToySimulator())
+
+
+def test_page_has_slices_simulated_elsewhere(result, tmp_path):
+    threads = []
+    reporter = Reporter(lambda _: threads.append(threading.current_thread()) or ToySimulator())
+    reporter.begin(tmp_path / 'report.html', result, ORIGIN)
+    reporter.begin(tmp_path / 'report_2.html', result, ORIGIN)
+    for thread in reporter._threads:
+        thread.join()
+    assert len(set(threads)) == 2
+    assert threading.current_thread() not in threads
+    for file in ('report.html', 'report_2.html'):
+        assert 'Along flexibility' in (tmp_path / file).read_text(encoding='utf-8')
+    assert list(reporter.failures()) == []
+
+
+def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path):
+    reporter = Reporter(lambda _: ToySimulator(0.1))  # the slices would take half a minute
+    reporter.begin(tmp_path / 'report.html', result, ORIGIN)
+    reporter.close()
+    page = (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert page.endswith('</html>\n')
+    assert 'Left out' in page
+
+
+@pytest.mark.parametrize('engine', [ToySimulator(crash=True), None])
+def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine):
+    reporter = Reporter(lambda _: engine)
+    reporter.begin(tmp_path / 'report.html', result, ORIGIN)
+    reporter.close()
+    assert 'Left out' in (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert list(reporter.failures()) == []
+
+
+def test_page_that_cannot_be_written_is_told_once(result, tmp_path):
+    reporter = Reporter(lambda _: ToySimulator())
+    reporter.begin(tmp_path / 'none' / 'report.html', result, ORIGIN)
+    reporter.close()
+    told, = reporter.failures()
+    assert str(tmp_path / 'none' / 'report.html') in told
+    assert list(reporter.failures()) == []

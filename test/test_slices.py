@@ -1,0 +1,99 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Slices go through what was found, show how the fit worsens, and end in time."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials, TRUTH
+from toy_simulator import ToySimulator
+
+from dlo_calibration.config import Options
+from dlo_calibration.slices import cut, LEVELS, NARROWEST, pairs
+from dlo_calibration.worker import calibrate_with
+
+
+@pytest.fixture(scope='module')
+def result():
+    """Return what the toy finds; its optimum is the truth."""
+    found = calibrate_with(toy_trials(2), Options.of({'workers': 1}), lambda _: ToySimulator())
+    assert found.values == pytest.approx(TRUTH, abs=1.0)
+    return found
+
+
+def test_a_line_per_parameter_whose_lowest_error_is_at_the_truth(result):
+    slices = cut(result, ToySimulator())
+    assert [line.name for line in slices.lines] == list(result.space.free)
+    for line in slices.lines:
+        assert len(line.values) in (LEVELS[-1] + 1, LEVELS[-1] + 2)
+        assert (np.diff(line.values) > 0).all()
+        assert line.values[line.errors.argmin()] == pytest.approx(TRUTH[line.name], abs=1.0)
+        assert line.values[-1] - line.values[0] >= NARROWEST
+        assert 0 <= line.values[0] and line.values[-1] <= 100
+    assert slices.complete
+
+
+def test_errors_are_those_of_the_simulator(result):
+    line = cut(result, ToySimulator()).lines[0]
+    # The toy lifts the chain by a sine arch of 0.2 m for the whole scale.
+    arch = 0.2 * np.sin(np.linspace(0, np.pi, len(result.trials[0].initial)))
+    expected = abs(line.values - TRUTH['flexibility']) / 100 * np.sqrt(np.mean(arch**2))
+    assert line.errors == pytest.approx(expected, abs=2e-3)
+
+
+def test_plane_has_the_first_parameter_along_the_first_axis(result):
+    slices = cut(result, ToySimulator())
+    plane = slices.planes[0]
+    lines = {line.name: line for line in slices.lines}
+    k = int(np.abs(plane.values[1] - result.values[plane.names[1]]).argmin())
+    line = lines[plane.names[0]]
+    assert plane.errors[:, k] == pytest.approx(np.interp(plane.values[0], line.values, line.errors), abs=0.02)
+    assert plane.errors.shape == (plane.values.shape[1],) * 2
+
+
+def test_pair_that_depends_on_each_other_most_comes_first(result):
+    names = list(result.space.free)
+    covariance = np.eye(4) * 1e-4
+    covariance[1, 2] = covariance[2, 1] = 0.9e-4
+    covariance[0, 3] = covariance[3, 0] = 0.2e-4
+    examination = replace(result.examination, uncertainty=replace(
+        result.examination.uncertainty, covariance=covariance, excited=np.ones(4, dtype=bool)))
+    expected = [(names.index('elasticity'), names.index('friction'))]
+    assert pairs(replace(result, examination=examination)) == expected
+
+
+def test_what_takes_too_long_is_left_out(result):
+    now = iter(np.arange(10000.0))
+    slices = cut(result, ToySimulator(), seconds=60, clock=lambda: next(now))
+    assert not slices.complete
+    assert slices.evaluations < 60
+    assert all(len(line.values) <= LEVELS[0] + 2 for line in slices.lines)
+    nothing = cut(result, ToySimulator(), should_stop=lambda: True)
+    assert (nothing.lines, nothing.planes, nothing.evaluations, nothing.complete) == ((), (), 0, False)
+
+
+def test_failures_are_infinite(result):
+    slices = cut(result, ToySimulator(fail_below=result.values['flexibility'] - 1.0))
+    line = slices.lines[0]
+    assert math.isinf(line.errors[0]) and math.isinf(line.scores[0])
+    assert np.isfinite(line.errors[-1])
+
+
+def test_is_the_same_each_time(result):
+    one, two = (cut(result, ToySimulator()) for _ in range(2))
+    assert all(np.array_equal(a.errors, b.errors) for a, b in zip(one.lines, two.lines, strict=True))
+    assert one.evaluations == two.evaluations
