@@ -151,11 +151,14 @@ def test_foxglove_shows_every_panel_that_is_set_up_and_no_other():
 def test_foxglove_plots_values_that_the_node_sends():
     best = Evaluation(0, None, dict.fromkeys(Options().calibrate, 50.0), (1.0,))
     message = diagnostics.progress(bag_types(), stamp=1, evaluation=best, best=best, evaluations=2,
-                                   simulations_per_second=1.0, seconds_left=1.0)
+                                   simulations_per_second=1.0, seconds_left=1.0,
+                                   spread=dict.fromkeys(Options().calibrate, 1.0))
     sent = {(one.name, pair.key) for one in message.status for pair in one.values}
     plotted = {re.fullmatch(
         r'/calibrator/progress\.status\[:\]\{name=="(\w+)"\}\.values\[:\]\{key=="(\w+)"\}\.value',
         path['value']).groups()
         for panel in foxglove_layout()['configById'].values() for path in panel.get('paths', [])}
     assert plotted <= sent
-    assert {('progress', f'best_{name}') for name in Options().calibrate} <= plotted
+    assert {('progress', f'{what}_{name}') for name in Options().calibrate
+            for what in ('best', 'spread')} <= plotted
+    assert {('progress', 'score'), ('progress', 'best_score')} <= plotted

@@ -294,6 +294,23 @@ def test_progress_tells_speed_and_time_left():
     assert progress.seconds_left == 3.0
 
 
+def test_progress_tells_how_far_good_evaluations_lie_apart():
+    """The best 5 % count, 8 at least, by their root mean square distance from the best; failures never do."""
+    def tried(index, value, scores, **rest):
+        return Evaluation(index, np.array([value / 100]), {'friction': value}, scores, **rest)
+
+    progress = Progress(1000, 2)
+    assert progress.spread == {}
+    progress.take(tried(0, 40.0, (1.0, 1.0)))
+    assert progress.spread == {'friction': 0.0}
+    for k in range(7):
+        progress.take(tried(1 + k, 50.0, (2.0, 2.0)))
+    for one in (tried(8, 0.0, (), failure='diverged'), tried(9, 0.0, (3.0, float('nan')), skipped=1),
+                *(tried(10 + k, 100.0, (3.0, 3.0)) for k in range(20))):
+        progress.take(one)
+    assert progress.spread == pytest.approx({'friction': 10 * (7 / 8)**0.5})
+
+
 def test_worker_lives_in_a_thread_of_its_own():
     threads = []
     worker = Worker(lambda _: threads.append(threading.current_thread()) or ToySimulator())
