@@ -103,9 +103,10 @@ def plane_figure(result: CalibrationResult, plane: Plane) -> str:
 
 
 def correlation_table(result: CalibrationResult) -> str:
-    """Return a table of the correlations, as colours and numbers; empty where they are not known."""
+    """Return a table of the correlations, as colours and numbers; empty where there are none."""
     found = result.examination
-    if found is None or not found.regular or found.uncertainty.correlations is None:
+    if found is None or not found.regular or found.uncertainty.correlations is None \
+            or result.space.dimension < 2:
         return ''
     names = result.space.free
     head = ''.join(f'<th scope="col">{name}</th>' for name in names)

@@ -18,7 +18,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any, Mapping, Sequence, TYPE_CHECKING
 
@@ -67,13 +66,6 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
         figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-def trial_png(trial: Trial, chains: Floats | None) -> bytes:
-    """Return the picture of one trial as the bytes of a PNG."""
-    buffer = io.BytesIO()
-    _figure([trial], None if chains is None else [chains]).savefig(buffer, format='png', dpi=90)
-    return buffer.getvalue()
 
 
 def unwritable(path: str | Path, error: OSError) -> InputError:

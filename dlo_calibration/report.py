@@ -269,7 +269,7 @@ def _surroundings(result: CalibrationResult, slices: Slices | None) -> str:
         parts.append(f'<h3>{escape(one)} and {escape(two)}</h3>' + _note(
             'Both vary; light fits well. A long slanted valley means that they can make up for each other.')
             + plane_figure(result, plane))
-    coarse = '' if slices.complete else '; it is coarse, as more would have taken too long'
+    coarse = '' if slices.complete else '; it is coarse, or lacks a part, as more would have taken too long'
     parts.append(_note(f'{slices.evaluations} more parameter sets were simulated for this{coarse}.'))
     return ''.join(parts)
 

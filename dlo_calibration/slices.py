@@ -29,7 +29,7 @@ from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.parameters import SCALE
 from dlo_calibration.simulator import Simulator
 
-SECONDS = 5.0  # that slices may take; what is not there by then is left out
+SECONDS, SHARE, MOST_SECONDS = 5.0, 0.2, 60.0  # that slices may take; what is not there by then is left out
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first
 FINEST_PLANE = 8
 REACH = 4.0  # standard deviations that a slice goes to each side,
@@ -83,13 +83,16 @@ class Slices:
 
 
 def cut(result: CalibrationResult, simulator: Simulator, should_stop: Callable[[], bool] = lambda: False, *,
-        seconds: float = SECONDS, clock: Callable[[], float] = time.monotonic) -> Slices:
+        seconds: float | None = None, clock: Callable[[], float] = time.monotonic) -> Slices:
     """
     Simulate slices around a result, the coarse ones first, until the time is up.
 
     :param simulator: the engine of the result.
     :param should_stop: asked between trials; once True, what is there is returned.
+    :param seconds: that it may take; None: a fifth of what the calibration took, 5 to 60 s.
     """
+    if seconds is None:
+        seconds = min(max(SECONDS, SHARE * result.seconds), MOST_SECONDS)
     end = clock() + seconds
     cutter = _Cutter(result, Evaluator(result.trials, result.space, simulator),
                      lambda: should_stop() or clock() > end)

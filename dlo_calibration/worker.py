@@ -178,7 +178,7 @@ def sliced_with(result: CalibrationResult, options: Options, make_simulator: Sim
     """
     Simulate slices around a result, in this thread; None where the engine fails.
 
-    It takes `slices.SECONDS` at most.
+    They may be coarse, as the time for them is short: see `slices.cut`.
     """
     try:
         with closing(make_simulator(options)) as simulator:

@@ -26,7 +26,7 @@ from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.animation import densely, MOST_FRAMES, simulated_motion, write_animation
-from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture, trial_png
+from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture
 from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.simulator import Rollout
 from dlo_calibration.trial import shown_goals, Trial
@@ -42,6 +42,13 @@ def tracked(count):
     goals = [Goal(Chain(trial.initial.points + (0, 0, 0.01 * k)), 0.05 * k, stable=False)
              for k in range(count)]
     return replace(trial, goals=goals)
+
+
+def trial_png(trial, chains):
+    """Return the picture as the bytes of a PNG."""
+    buffer = io.BytesIO()
+    trial_picture(trial, chains, buffer)
+    return buffer.getvalue()
 
 
 def pixels(trial, chains):

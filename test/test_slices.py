@@ -86,6 +86,13 @@ def test_what_takes_too_long_is_left_out(result):
     assert (nothing.lines, nothing.planes, nothing.evaluations, nothing.complete) == ((), (), 0, False)
 
 
+@pytest.mark.parametrize('seconds, most', [(1.0, 5), (100.0, 20), (1e4, 60)])
+def test_takes_a_fifth_of_the_time_of_the_calibration_within_bounds(result, seconds, most):
+    now = iter(np.arange(10000.0))
+    slices = cut(replace(result, seconds=seconds), ToySimulator(), clock=lambda: next(now))
+    assert 0 < slices.evaluations <= most
+
+
 def test_failures_are_infinite(result):
     slices = cut(result, ToySimulator(fail_below=result.values['flexibility'] - 1.0))
     line = slices.lines[0]
