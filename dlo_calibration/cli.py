@@ -430,6 +430,8 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    from dlo_calibration.report import as_flags
+
     given = _given(chosen)
 
     def observe(path: Path, of_result: Mapping[str, Any] | None = None) -> Observed:
@@ -437,7 +439,7 @@ def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) ->
         found = _read(one, lambda text: _note(f'{path}: {text}'), of_result)
         return Observed(_some(found), found.options)
 
-    flags = [flag for name, value in given.items() for flag in _as_flags(name, value)]
+    flags = [flag for name, value in given.items() for flag in as_flags(name, value)]
     plan = experiment_verb.planned(chosen, given, [PROGRAM, 'experiment'], flags, observe)
     with StopFlag() as stop:
         account = experiment_verb.act(plan, chosen.output, make_simulator, stop, _note, sys.stderr)

@@ -102,7 +102,7 @@ def repeating_command(session: str, options: Options) -> str:
     """Return the command that calibrates on a session with the same options."""
     changed = _changed(options)
     return shlex.join(['dlo-calibration', 'fit', session,
-                       *(word for name, value in changed.items() for word in _as_flags(name, value))])
+                       *(word for name, value in changed.items() for word in as_flags(name, value))])
 
 
 def digests(paths: Iterable[Path]) -> dict[str, str]:
@@ -312,7 +312,8 @@ def _changed(options: Options) -> dict[str, Any]:
     return {name: value for name, value in options.flat().items() if value != defaults[name]}
 
 
-def _as_flags(name: str, value: Any) -> list[str]:
+def as_flags(name: str, value: Any) -> list[str]:
+    """Return the words of a command that give an option that value."""
     flag = f'--{name.replace("_", "-")}'
     if isinstance(value, bool):
         return [flag if value else f'--no-{flag[2:]}']

@@ -74,13 +74,14 @@ def test_result_tells_the_whole(types):
     assert values.pop('seconds') == '9.1'
     assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
     assert float(values.pop('error_percent_of_length')) == pytest.approx(0.1)
+    assert 'friction could not be told' in values.pop('findings')
     for key, millimetres in (('mean', 2), ('rms', 3), ('max', 10), ('mean_abs', 1)):
         assert float(values.pop(f'{key}_error_mm')) == pytest.approx(millimetres)
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent',
         'warnings': 'one; two', 'undetermined': '', 'cross_validated_error_mm': '', 'default_error_mm': '',
-        'noise_mm': '', 'residual_std_mm': '', 'findings': 'not identifiable from these trials: friction'}
+        'noise_mm': '', 'residual_std_mm': ''}
     assert one.level == types.level(1)
     clean = found_result(warnings=(), seed=None)
     one, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']
