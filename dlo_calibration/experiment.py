@@ -286,7 +286,7 @@ class Journal:
             'outcome': asdict(outcome), 'key': task.key})
         try:
             with self._path.open('a', encoding='utf-8') as stream:
-                stream.write(f'{chr(10) if self._cut else ""}{line}\n')
+                stream.write(('\n' if self._cut else '') + f'{line}\n')
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
