@@ -31,6 +31,8 @@ import sys
 import tempfile
 
 HERE = Path(__file__).resolve().parent
+#: The trials of a session of the other actions, as convert.py orders them.
+OTHER = ('place_middle', 'hold_end', 'place_three_quarters', 'drag_end', 'fold')
 OBJECTS = tuple(f'object{k}' for k in range(1, 6))
 
 
@@ -51,7 +53,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         fitted = [convert(name, folder / name, 'fitted') for name in OBJECTS]
-        other = [convert(name, folder / f'{name}_other', 'other') for name in OBJECTS]
+        other = [convert(name, folder / f'{name}_other', ','.join(OTHER)) for name in OBJECTS]
         done = subprocess.run(
             [sys.executable, '-m', 'dlo_calibration', 'experiment', *map(str, fitted), '--validate-on',
              *map(str, other), '--runs', arguments.runs, '--output', str(arguments.output)],
@@ -59,7 +61,8 @@ def main() -> None:
             env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
     text = done.stdout.replace(f'{folder}/', '')
     print(text)
-    command = f'`python benchmark/experiment.py --runs {arguments.runs}`, which does'
+    command = (f'Trials 1 to 5: {", ".join(OTHER)}.  Made by `python benchmark/experiment.py '
+               f'--runs {arguments.runs}`, which does')
     (HERE / 'results' / 'experiment_other.md').write_text(
         text.replace('# Consistency and validity\n',
                      f'# Consistency and validity, judged by five other actions\n\n{command}\n', 1))
