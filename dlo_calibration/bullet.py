@@ -199,10 +199,16 @@ class BulletRope:
         self._support = self._velocities - self._wanted
         self._points = points
 
-    def advance(self, targets: Floats) -> None:
-        """Take k steps; targets (k, h, 3) [m] of the held nodes after each."""
-        for target in targets:
+    def advance(self, targets: Floats, path: Floats | None = None) -> None:
+        """
+        Take k steps; targets (k, h, 3) [m] of the held nodes after each.
+
+        :param path: (k, N, 3) to write all nodes to after each step [m].
+        """
+        for k, target in enumerate(targets):
             self.step(target)
+            if path is not None:
+                path[k] = self._points
 
     def remove(self) -> None:
         """Take the rope out of the world."""

@@ -27,7 +27,7 @@ from dlo_calibration.layout import RESTING_BAND, resting_level
 from dlo_calibration.noise import noise, smooth
 from dlo_calibration.parameters import BY_NAME, GRAVITY, measured, ParameterSpace, SCALE
 from dlo_calibration.suspension import Balance, balance, hanging_parts
-from dlo_calibration.trial import Trial
+from dlo_calibration.trial import shown_goals, Trial
 
 SIGMAS = 3.0  # of noise that a range leaves room for
 STIFFNESS_MARGIN = 2.0  # factor, either way, for natural curvature, twist and all that is left out
@@ -294,7 +294,8 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
     radii = np.geomspace(parameter.at_zero, parameter.at_hundred, RADII)
     allowed = np.ones(RADII, bool)
     for trial in trials:
-        for chain in (trial.initial, *(goal.chain for goal in trial.goals)):
+        seen = shown_goals(len(trial.goals))  # of hundreds, a few: it is a bound, the fewer the wider
+        for chain in (trial.initial, *(trial.goals[k].chain for k in seen)):
             along, space = _apart(chain)
             spacing = float(np.linalg.norm(np.diff(chain.points, axis=0), axis=1).max())
             room = space * RADIUS_MARGIN + SIGMAS * sigma

@@ -545,14 +545,16 @@ def rest_on_table(points: Floats, velocities: Floats, level: float, friction: fl
 
 @_compiled(f'i8(f8[:,:,::1], {INDICES}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR},'
            f' {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX},'
-           f' {MATRIX}, {VECTOR})')
+           f' {MATRIX}, {VECTOR}, f8[:,:,::1])')
 def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, support: Floats, rest: Floats,
             stiffness: Floats, masses: Floats, inverse_masses: Floats, bending: Floats, natural: Floats,
             spans: Floats, distances: Floats, pairs: Any, contacts: Floats, bands: Floats, right: Floats,
-            wanted: Floats, change: Floats, constants: Floats) -> int:
+            wanted: Floats, change: Floats, constants: Floats, path: Floats) -> int:
     """
-    Take k steps; everything but `targets` (k, h, 3) [m] is the state, see `compiled.CompiledRope`.
+    Take k steps; what is not explained here is the state, see `compiled.CompiledRope`.
 
+    :param targets: (k, h, 3) [m] where the held nodes are after each step.
+    :param path: (k, N, 3) to write where all nodes are after each step [m]; or empty.
     :returns: how many steps were taken; fewer than k where the rollout diverged.
     """
     drag, implicit, step, gravity = constants[0], constants[1], constants[2], constants[3]
@@ -596,4 +598,6 @@ def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, supp
         for h in range(len(held)):
             for c in range(3):
                 points[held[h], c] = targets[k, h, c]
+        if len(path) > 0:
+            path[k] = points
     return len(targets)

@@ -39,6 +39,7 @@ from dlo_calibration.trial import Goal, Trial
 
 CHECKS = 5  # of the displacement within one stable_time
 ROUNDING = 1e-9  # s
+LONGEST_TRACE = 5000  # steps that are kept at a time
 
 
 @dataclass(frozen=True)
@@ -68,11 +69,12 @@ class Stepper(Protocol):
     def hold(self, nodes: tuple[int, ...]) -> None:
         """Let exactly these nodes follow a path from now on."""
 
-    def advance(self, targets: Floats) -> None:
+    def advance(self, targets: Floats, path: Floats = ...) -> None:
         """
         Take k steps.
 
         :param targets: (k, h, 3) [m] where the held nodes are after each step.
+        :param path: (k, N, 3) to write all nodes to after each step [m]; if given.
         """
 
 
@@ -111,6 +113,7 @@ class _Course:
     def rollout(self) -> Rollout:
         """Go from goal to goal."""
         chains, settled = [], []
+        traced: dict[int, Floats] = {}
         for k, goal in enumerate(self._trial.goals):
             self._ahead = self._trial.goals[k:]
             if goal.stable:
@@ -121,7 +124,9 @@ class _Course:
                 self._time = now  # waiting takes no time of the trial
                 chains.append(self._observed(self._stepper.points))
             else:
-                chains.append(self._observed(self._points_at(goal.time)))
+                if k not in traced:
+                    traced = {k: self._observed(self._points_at(goal.time)), **self._trace(k + 1)}
+                chains.append(traced[k])
                 settled.append(True)
         return Rollout(np.array(chains), tuple(settled), self._steps * self._stepper.time_step, self._steps)
 
@@ -141,6 +146,39 @@ class _Course:
             self._open_arrived()
         share = (instant - start) / (self._time - start) if self._time > start else 0.0
         return before + min(max(share, 0.0), 1.0) * (self._stepper.points - before)
+
+    def _trace(self, first: int) -> dict[int, Floats]:
+        """
+        Return the observed points at timed goals, from the index `first` on, up to the next event of a hand.
+
+        The same as going to each by itself, in one call to the stepper.
+        """
+        step = self._stepper.time_step
+        self._close()
+        events = [hand.start for hand in self._waiting] + [
+            grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+        end = min(events, default=math.inf) - 2 * step
+        arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
+        count, last = 0, first
+        for goal in self._trial.goals[first:]:
+            if goal.stable or goal.time > end or goal.time - self._time > LONGEST_TRACE * step or not all(
+                    self._trial.holds(hand, goal) for hand in arrived):
+                break
+            count = max(0, math.ceil((goal.time - ROUNDING - self._time) / step))
+            last += 1
+        if not count:
+            return {}
+        path = np.concatenate([[self._last[0], self._stepper.points],
+                               np.empty((count, *self._stepper.points.shape))])
+        times = np.concatenate([[self._last[1]], self._time + step * np.arange(count + 1)])
+        self._advance(count, path[2:])
+        self._last = path[-2], float(times[-2])
+        instants = np.array([goal.time for goal in self._trial.goals[first:last]])
+        after = np.clip(np.searchsorted(times, instants - ROUNDING), 1, len(times) - 1)
+        widths = times[after] - times[after - 1]
+        shares = np.clip((instants - times[after - 1]) / np.maximum(widths, ROUNDING), 0.0, 1.0)
+        points = path[after - 1] + shares[:, None, None] * (path[after] - path[after - 1])
+        return dict(zip(range(first, last), self._layout.observe @ points, strict=True))
 
     def _act_until(self, until: float) -> None:
         """Let hands act until then; where none moves, go on at most until the DLO is at rest."""
@@ -208,10 +246,14 @@ class _Course:
         self._rests = False
         self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
 
-    def _advance(self, count: int) -> None:
+    def _advance(self, count: int, path: Floats | None = None) -> None:
         targets = [grip.path[np.minimum(np.arange(count) + self._steps - grip.closed, len(grip.path) - 1)]
                    for grip in self._grips.values()]
-        self._stepper.advance(np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3)))
+        steps = np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3))
+        if path is None:
+            self._stepper.advance(steps)
+        else:
+            self._stepper.advance(steps, path)
         self._time += count * self._stepper.time_step
         self._steps += count
         self._rests = False

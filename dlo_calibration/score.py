@@ -89,14 +89,25 @@ class TrialScore:
     """The difference score of one trial; what depends on its goals alone is found once."""
 
     def __init__(self, trial: Trial) -> None:
-        self._goals = tuple((goal.chain.points, focal_point(trial, goal), feature_points(trial, goal))
-                            for goal in trial.goals)
+        self._points = np.stack([goal.chain.points for goal in trial.goals])
+        self._reference = np.array([focal_point(trial, goal) for goal in trial.goals])
+        self._features = np.zeros(self._points.shape[:2])
+        for k, goal in enumerate(trial.goals):
+            self._features[k, feature_points(trial, goal)] = 1.0
+        self._shape = self._extent(self._points)
+
+    def _extent(self, chains: Floats) -> Floats:
+        """Return (g, 3) [m]: the sums over the points of |p_ref - p_i| by coordinate."""
+        references = chains[np.arange(len(chains)), self._reference]
+        return np.asarray(np.abs(references[:, None, :] - chains).sum(axis=1))
 
     def __call__(self, chains: Floats) -> float:
         """Return the score [cm] of simulated (g, n, 3) [m] chains, averaged over the g goals."""
-        return float(np.mean([difference_score(points, chain, reference, features)
-                              for (points, reference, features), chain in zip(
-                                  self._goals, chains, strict=True)]))
+        if chains.shape != self._points.shape:
+            raise ValueError(f'chains of shape {chains.shape}, expected {self._points.shape}')
+        place = np.einsum('gi,gij->gj', self._features, np.abs(self._points - chains))
+        difference = self._shape - self._extent(chains) + place
+        return float(np.linalg.norm(difference, axis=1).mean()) * CENTIMETRES
 
 
 def trial_score(trial: Trial, chains: Floats) -> float:

@@ -243,23 +243,18 @@ def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
     Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial,
     each summed up to the first that white noise could show.
     """
+    blocks = [residuals[rows].reshape(goals, points, 3)
+              for rows, (goals, points) in zip(_rows(shapes), shapes, strict=True)]
+    power = float(np.mean([np.square(block).mean() for block in blocks]))
     lengths = []
     for axis in (1, 0):
-        products: dict[int, list[Floats]] = {}
-        squares, at = [], 0
-        for goals, points in shapes:
-            block = residuals[at:at + 3 * goals * points].reshape(goals, points, 3)
-            at += block.size
-            block = np.moveaxis(block, axis, 0)
-            squares.append(np.square(block).mean())
-            for lag in range(1, len(block) // 2 + 1):
-                products.setdefault(lag, []).append((block[lag:] * block[:-lag]).ravel())
-        power = float(np.mean(squares))
-        length = 1.0
-        for lag in sorted(products):
-            values = np.concatenate(products[lag])
-            correlation = float(values.mean()) / power if power > 0 else 0.0
-            if correlation < 2 / np.sqrt(len(values)):
+        length, turned = 1.0, [np.moveaxis(block, axis, 0) for block in blocks]
+        for lag in range(1, max(len(block) for block in turned) // 2 + 1):
+            pairs = [(block[lag:], block[:-lag]) for block in turned if lag <= len(block) // 2]
+            count = sum(one.size for one, _ in pairs)
+            product = sum(float(np.vdot(one, other)) for one, other in pairs) / count
+            correlation = product / power if power > 0 else 0.0
+            if correlation < 2 / np.sqrt(count):
                 break
             length += 2 * correlation
         lengths.append(length)

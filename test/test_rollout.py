@@ -47,14 +47,16 @@ class Sinking:
         assert len(set(nodes)) == len(nodes)
         self._held = list(nodes)
 
-    def advance(self, targets):
+    def advance(self, targets, path=None):
         assert targets.shape[1:] == (len(self._held), 3)
-        for target in targets:
+        for k, target in enumerate(targets):
             if self._left > 0:
                 free = np.setdiff1d(np.arange(len(self._points)), self._held)
                 self._points[free, 2] -= SPEED * STEP
             self._left -= 1
             self._points[self._held] = target
+            if path is not None:
+                path[k] = self._points
 
 
 def rolled(hands, goals, until=np.inf, settling=None, nodes=11):
