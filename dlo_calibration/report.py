@@ -71,12 +71,13 @@ td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabula
 .legend { list-style: none; margin: .2rem 0 1rem; padding: 0; font-size: .85rem; line-height: 1.4; }
 .legend li { display: inline-block; margin-right: 1.2rem; padding-left: 34px; text-indent: -34px; }
 .legend svg { vertical-align: middle; margin-right: 2px; }
-.scale { font-size: .85rem; } .scale span { display: inline-block; width: 8rem; height: .8rem; }
-pre { background: #f4f4f4; padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere; }
+.scale { font-size: .85rem; } .scale span { display: inline-block; width: 5rem; height: .8rem; }
+pre { background: #f4f4f4; padding: .7rem; overflow-x: auto; }
 .hash { font-family: monospace; overflow-wrap: anywhere; font-size: .85rem; }
 nav a { margin-right: 1rem; }
 @media print { body { margin: 0; max-width: none; font-size: 11pt; } nav { display: none; }
-  .charts, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } * { print-color-adjust: exact; } }
+  pre { white-space: pre-wrap; } .charts, tr { break-inside: avoid; }
+  h2, h3 { break-after: avoid; } * { print-color-adjust: exact; } }
 """
 
 
