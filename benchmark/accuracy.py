@@ -15,7 +15,7 @@
 """
 Measure how well `fit` does on known objects and on measured cables, as a user would.
 
-    python benchmark/accuracy.py [reference] [mocap] [hanging] [--evaluations N] [--seed S]
+    python benchmark/accuracy.py [reference] [mocap] [hanging] [--search NAME] [--evaluations N] [--seed S]
 
 Each figure is what `dlo-calibration fit` and `validate` print for sessions that
 convert.py makes; nothing else is computed here but means.  The tables are
@@ -33,12 +33,17 @@ import sys
 import tempfile
 from typing import Any
 
+import numpy as np
+
 HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,1,2,3,4,5,6,7'
 MOCAP_OTHER = '42,43,44,45,46,47,48,49,50,51,52,53,54,55'
-MOCAP_PARAMETERS = 'flexibility,elasticity,damping,internal_damping'
-HANGING_PARAMETERS = 'flexibility'
+MOCAP_PARAMETERS = 'flexibility,elasticity,damping,internal_damping,torsion'
+MOCAP_PARTS = '6'
+HANGING_PARAMETERS = 'flexibility,length_scale'
+HANGING_NODES = '61'
+WIRE = 1.5  # m
 
 
 def convert(kind: str, source: str, output: Path, *arguments: str) -> Path:
@@ -98,21 +103,40 @@ def reference(folder: Path, options: list[str]) -> str:
 
 
 def mocap(folder: Path, options: list[str]) -> str:
-    """Tabulate cable 2: fitted on 8 recordings, judged on 14 others."""
-    fitted = fit(convert('mocap', 'dlo2', folder / 'dlo2', '--recordings', MOCAP_FIT), folder / 'dlo2_fit',
-                 '--calibrate', MOCAP_PARAMETERS, *options)
-    other = validate(folder / 'dlo2_fit',
-                     convert('mocap', 'dlo2', folder / 'dlo2_other', '--recordings', MOCAP_OTHER))
-    return table('recordings', fitted, other)
+    """Tabulate three cables: fitted on 8 recordings, judged on 14 others."""
+    parts = []
+    for cable in ('dlo1', 'dlo2', 'dlo3'):
+        session = convert('mocap', cable, folder / cable, '--recordings', MOCAP_FIT)
+        fitted = fit(session, folder / f'{cable}_fit', '--calibrate', MOCAP_PARAMETERS,
+                     '--parts', MOCAP_PARTS, *options)
+        other = validate(folder / f'{cable}_fit',
+                         convert('mocap', cable, folder / f'{cable}_other', '--recordings', MOCAP_OTHER))
+        parts.append(f'## {cable}\n\n{table("recordings", fitted, other)}')
+    return '\n\n'.join(parts)
 
 
 def hanging(folder: Path, options: list[str]) -> str:
-    """Tabulate the white wire: fitted on four repeats, judged on the fifth."""
-    fitted = fit(convert('hanging', 'white', folder / 'white', '--repeats', '0,1,2,3'), folder / 'white_fit',
-                 '--calibrate', HANGING_PARAMETERS, *options)
-    other = validate(folder / 'white_fit',
-                     convert('hanging', 'white', folder / 'white_other', '--repeats', '4'))
-    return table('repeats', fitted, other)
+    """Tabulate two wires: fitted on four repeats, judged on the fifth; and EI of each repeat by itself."""
+    parts = []
+    arguments = ['--calibrate', HANGING_PARAMETERS, '--nodes', HANGING_NODES, *options]
+    for wire in ('white', 'black'):
+        fitted = fit(convert('hanging', wire, folder / wire, '--repeats', '0,1,2,3'), folder / f'{wire}_fit',
+                     *arguments)
+        other = validate(folder / f'{wire}_fit',
+                         convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4'))
+        stiffness = []
+        for repeat in '01234':
+            session = convert('hanging', wire, folder / f'{wire}_{repeat}', '--repeats', repeat)
+            one = fit(session, folder / f'{wire}_{repeat}_fit', *arguments)
+            stiffness.append(one['parameters']['flexibility']['physical_value'])
+        percent = [100 * one['rms_error_m'] / WIRE for one in (fitted, other)]
+        spread = 100 * float(np.std(stiffness) / np.mean(stiffness))
+        parts.append(
+            f'## {wire}\n\n{table("repeats", fitted, other)}\n\nRoot mean square: {percent[0]:.2f} % of the '
+            f'length fitted, {percent[1]:.2f} % predicted. EI of each repeat by itself: '
+            + ', '.join(f'{value:.3g}' for value in stiffness)
+            + f' N m^2, standard deviation {spread:.0f} %.')
+    return '\n\n'.join(parts)
 
 
 def table(what: str, fitted: dict[str, Any], other: dict[str, Any]) -> str:
@@ -139,17 +163,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('tables', nargs='*', metavar='TABLE', help=', '.join(TABLES))
+    parser.add_argument('--search', default='least_squares')
     parser.add_argument('--evaluations', default='150')
     parser.add_argument('--seed', default='1')
     arguments = parser.parse_args()
     unknown = set(arguments.tables) - set(TABLES)
     if unknown:
         parser.error(f'unknown table {", ".join(sorted(unknown))}; there are {", ".join(TABLES)}')
-    options = ['--search', 'random', '--evaluations', arguments.evaluations, '--seed', arguments.seed]
+    options = ['--search', arguments.search, '--evaluations', arguments.evaluations, '--seed', arguments.seed]
     for name in arguments.tables or TABLES:
         with tempfile.TemporaryDirectory() as folder:
-            text = (f'# {name}\n\n`python benchmark/accuracy.py {name} --evaluations {arguments.evaluations} '
-                    f'--seed {arguments.seed}`\n\n{TABLES[name](Path(folder), options)}\n')
+            command = ' '.join(['python benchmark/accuracy.py', name, *options])
+            text = f'# {name}\n\n`{command}`\n\n{TABLES[name](Path(folder), options)}\n'
         print(text)
         target = HERE / 'results' / f'{name}.md'
         target.parent.mkdir(exist_ok=True)
