@@ -81,7 +81,7 @@ def machines(tmp_path):
 
 
 def options(address='', **flat):
-    return Options.of({'evaluations': 100, 'workers': 1, 'scheduler': address, **flat})
+    return Options.of({'search': 'random', 'evaluations': 100, 'workers': 1, 'scheduler': address, **flat})
 
 
 def same(first, second):

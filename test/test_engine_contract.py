@@ -398,7 +398,7 @@ def test_random_and_corner_parameter_sets_stay_finite(make):
     """Many of them, free parameters and the fixed ones, over a drag and a fold."""
     simulator = make(settle_limit=1.0)
     generator, count = np.random.default_rng(0), len(PARAMETERS)
-    sets = np.concatenate([generator.integers(0, 2, (80, count)), generator.random((40, count))])
+    sets = np.concatenate([generator.integers(0, 2, (40, count)), generator.random((20, count))])
     for k, point in enumerate(sets):
         trial = (drag_trial(noise=0.001), fold_trial())[k % 2]
         values = SPACE.values(point)

@@ -158,10 +158,12 @@ def test_instants_between_change_nothing_of_the_course(held_by):
         def hold(self, nodes):
             self.nodes = nodes
 
-        def advance(self, targets):
-            for target in targets:
+        def advance(self, targets, path=None):
+            for k, target in enumerate(targets):
                 self._points[list(self.nodes)] = target
                 self.course.append((self.nodes, self._points.copy()))
+                if path is not None:
+                    path[k] = self._points
 
     from dlo_calibration.layout import Layout
     trial, = toy_trials(1)
