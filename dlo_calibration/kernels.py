@@ -17,7 +17,8 @@ Kernels: the steps of `rod`, `natural`, `contact` and a table with friction, com
 
 They compute what `rod.Rod.velocities`, `natural.natural_forces` and `contact.SelfContact.velocities` do, and
 what Bullet does with spheres on a plane, for many steps in one call.  The machine
-code is kept in Numba's cache, so that it is compiled once a machine.
+code is kept in Numba's cache, so that it is compiled once a machine.  They are all in
+one file, because a change of this file is all that the cache looks at.
 """
 
 from __future__ import annotations
