@@ -36,15 +36,17 @@ from dlo_calibration.engines import make_simulator
 from dlo_calibration.search import Observation, SEARCHES
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.worker import hints
 
 HERE = Path(__file__).resolve().parent
 BUDGET = 150
 SHOWN = ('flexibility', 'elasticity', 'friction')
 
 
-def search_with(evaluator: Evaluator, name: str, seed: int) -> tuple[list[Observation], Observation]:
+def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
+                ) -> tuple[list[Observation], Observation]:
     """Return all observations of a search, and the one that it calls its result."""
-    search = SEARCHES[name](evaluator.space.dimension, seed)
+    search = SEARCHES[name](evaluator.space.dimension, seed, hints(evaluator.trials, options))
     seen: list[Observation] = []
     while len(seen) < BUDGET:
         points = search.ask(BUDGET - len(seen))
@@ -64,7 +66,7 @@ def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
     options = Options.of({**Options().flat(), **(session.options or {}), 'engine': engine})
     trials, _ = session_trials(session, options)
     evaluator = Evaluator(trials, options.space, make_simulator(options))
-    done = {one: [search_with(evaluator, one, seed) for seed in range(seeds)]
+    done = {one: [search_with(evaluator, options, one, seed) for seed in range(seeds)]
             for one in dict.fromkeys(['random', *names])}
     target = float(np.median([min(one.score for one in seen) for seen, _ in done['random']]))
     residuals = {one: [best.residuals for _, best in found] for one, found in done.items()}
