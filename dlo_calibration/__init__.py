@@ -25,9 +25,10 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dlo_calibration.action import Action, Hand
-    from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluation
+    from dlo_calibration.calibration import calibrate, CalibrationResult
     from dlo_calibration.chain import Chain
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+    from dlo_calibration.evaluation import Evaluation
     from dlo_calibration.parameters import Parameter, PARAMETERS, ParameterSpace
     from dlo_calibration.simulator import Rollout, Simulator
     from dlo_calibration.trial import Goal, Trial
@@ -39,8 +40,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    'action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult', 'Evaluation'),
+    'action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult'),
     'chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
+    'evaluation': ('Evaluation',),
     'parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulator': ('Rollout', 'Simulator'),
     'trial': ('Goal', 'Trial'),
 }

@@ -30,10 +30,11 @@ import queue
 import threading
 from typing import Any, Iterator, Sequence, Union
 
-from dlo_calibration.calibration import CalibrationResult, mean_length
+from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.evaluation import mean_length
 from dlo_calibration.gain import covers, Gain, glimpse, information, Knowledge, knowledge
 from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.pool import ProcessExecutor

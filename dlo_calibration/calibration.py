@@ -16,14 +16,10 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError, Executor, Future
-import copy
+from concurrent.futures import CancelledError, Executor
 from dataclasses import dataclass, replace
-import threading
 import time
-from typing import Callable, Iterator, Mapping, Sequence
-import uuid
-import weakref
+from typing import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -31,62 +27,19 @@ from dlo_calibration.advice import Advice, advise
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, Limits, mean_length
 from dlo_calibration.examination import Examination, examine
 from dlo_calibration.noise import noise
 from dlo_calibration.parameters import ParameterSpace, SCALE
-from dlo_calibration.score import PointErrors, residuals, TrialScore
+from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
-from dlo_calibration.simulator import Rollout, Simulator
+from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
-from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, matters_below, spread_of_best, Uncertainty
+from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
 EXACT = 1e-9  # relative error of a length that does not matter
 LENGTH_ENDS = float(np.sqrt(2.0))  # standard deviation of a length, in those of its two ends
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """
-    One parameter set tried on all trials (the paper calls it a round).
-
-    :param index: 0, 1, ... in the order asked.
-    :param point: (d,) in the unit cube.
-    :param values: free parameters on the 0..100 scale.
-    :param scores: difference score of each trial, NaN of one that was skipped; empty where it failed.
-    :param errors: over all goal points; None where it failed or was abandoned.
-    :param residuals: (m,) [m]; kept for the best evaluation only.
-    :param unsettled: names of trials that never came to rest.
-    :param failure: why it failed; empty where it did not.
-    :param skipped: number of trials that were not simulated any more: one before
-        them failed, or the evaluation was abandoned, as its score was too high already.
-    """
-
-    index: int
-    point: Floats
-    values: Mapping[str, float]
-    scores: tuple[float, ...] = ()
-    errors: PointErrors | None = None
-    residuals: Floats | None = None
-    unsettled: tuple[str, ...] = ()
-    failure: str = ''
-    skipped: int = 0
-
-    @property
-    def abandoned(self) -> bool:
-        """Whether trials were skipped because the score was too high already."""
-        return self.skipped > 0 and not self.failure
-
-    @property
-    def score(self) -> float:
-        """
-        Average difference score over the trials [cm]; infinite where it failed.
-
-        Where it was abandoned, a lower bound: no score is less than 0.
-        """
-        if self.abandoned:
-            return float(np.mean(np.nan_to_num(self.scores, nan=0.0)))
-        return float(np.mean(self.scores)) if self.scores else float('inf')
 
 
 @dataclass(frozen=True)
@@ -178,94 +131,6 @@ class CalibrationResult:
         return self.space.physical(self.values, self.length)
 
 
-def mean_length(trials: Sequence[Trial]) -> float:
-    """Return the mean length of the DLO as the trials begin [m]."""
-    return float(np.mean([trial.initial.length for trial in trials]))
-
-
-class Evaluator:
-    """
-    Tries parameter sets on trials.
-
-    It is pickled to worker processes and copied for worker threads: see `Simulator`.
-    """
-
-    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
-        self.trials = tuple(trials)
-        self.space = space
-        self.simulator = simulator
-        self._length = mean_length(trials)
-        self._scores = tuple(TrialScore(trial) for trial in trials)
-
-    def __copy__(self) -> Evaluator:
-        """Return one with a simulator of its own."""
-        return Evaluator(self.trials, self.space, copy.copy(self.simulator))
-
-    def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
-        """Simulate every trial with free parameters on the 0..100 scale."""
-        physical = self.space.physical(values, self._length)
-        return [self.simulator.simulate(trial, physical) for trial in self.trials]
-
-    def evaluate(self, index: int, point: Floats, should_stop: Callable[[], bool] = lambda: False,
-                 limits: Limits | None = None) -> Evaluation:
-        """
-        Try a (d,) point of the unit cube on every trial.
-
-        :param limits: None: every trial is simulated, whatever the others gave.
-        :raises CancelledError: as soon as `should_stop` says so, between trials.
-        """
-        point = frozen_array(point)
-        evaluation = Evaluation(index, point, self.space.values(point))
-        physical = self.space.physical(evaluation.values, self._length)
-        scores = np.full(len(self.trials), np.nan)
-        rollouts: dict[int, Rollout] = {}
-        for k in range(len(self.trials)) if limits is None else limits.order:
-            if should_stop():
-                raise CancelledError
-            left = len(self.trials) - len(rollouts) - 1
-            try:
-                rollouts[k] = self.simulator.simulate(self.trials[k], physical)
-            except SimulationError as error:
-                return replace(evaluation, failure=str(error), skipped=left)
-            scores[k] = self._scores[k](rollouts[k].chains)
-            evaluation = replace(
-                evaluation, scores=tuple(float(score) for score in scores), skipped=left,
-                unsettled=tuple(trial.name for j, trial in enumerate(self.trials)
-                                if j in rollouts and not all(rollouts[j].settled)))
-            if left and limits is not None and evaluation.score > limits.score:
-                return evaluation
-        residual = np.concatenate([residuals(trial, rollouts[j].chains)
-                                   for j, trial in enumerate(self.trials)])
-        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
-
-
-@dataclass(frozen=True)
-class Limits:
-    """
-    When evaluations are abandoned.
-
-    :param score: as soon as the score cannot be this low [cm] any more.
-    :param order: indices of the trials in the order to simulate them.
-    """
-
-    score: float
-    order: tuple[int, ...]
-
-    @classmethod
-    def of(cls, search: Search, evaluations: Sequence[Evaluation], budget: int) -> Limits | None:
-        """
-        Return what neither the search nor the result can tell from no limits; None: nothing is.
-
-        Trials that scored high so far come first, as they decide soonest.
-        """
-        complete = [one for one in evaluations if one.scores and not one.skipped]
-        score = max(search.limit, matters_below([one.score for one in complete], budget))
-        if not np.isfinite(score):
-            return None
-        mean = np.mean([one.scores for one in complete], axis=0)
-        return cls(score, tuple(int(k) for k in np.argsort(-mean, kind='stable')))
-
-
 def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, search: Search, *,
               budget: int = PAPER_EVALUATIONS,
               on_evaluation: Callable[[Evaluation], None] | None = None,
@@ -295,8 +160,8 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
                          'record an initial chain, an action and a goal chain first')
     started = clock()
 
-    def everywhere(evaluator: Evaluator) -> _Everywhere:
-        return _Everywhere(evaluator, should_stop, executor)
+    def everywhere(evaluator: Evaluator) -> Everywhere:
+        return Everywhere(evaluator, should_stop, executor)
 
     evaluate = everywhere(Evaluator(trials, space, simulator))
     kept, best, stopped = _searched(evaluate, search, budget, on_evaluation)
@@ -322,7 +187,7 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
         warnings=_warnings(best, kept), examination=examination)
 
 
-def _searched(evaluate: _Everywhere, search: Search, budget: int,
+def _searched(evaluate: Everywhere, search: Search, budget: int,
               on_evaluation: Callable[[Evaluation], None] | None
               ) -> tuple[list[Evaluation], Evaluation | None, bool]:
     """Return all evaluations of a search, the one it calls the best, and whether it was stopped."""
@@ -351,7 +216,7 @@ def _searched(evaluate: _Everywhere, search: Search, budget: int,
     return kept, best, stopped
 
 
-def _examined(evaluate: _Everywhere, everywhere: Callable[[Evaluator], _Everywhere],
+def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere],
               best: Evaluation) -> tuple[Examination, Evaluation]:
     """
     Return what is around the best evaluation, and that evaluation as it is reported.
@@ -489,85 +354,3 @@ def _warnings(best: Evaluation, kept: Sequence[Evaluation]) -> tuple[str, ...]:
         warnings.append(f'{len(failed)} of {len(kept)} evaluations could not be simulated: '
                         f'{failed[0].failure}')
     return tuple(warnings)
-
-
-class _Everywhere:
-    """Evaluates points in order, wherever the executor says; ends early, without a word, when stopped."""
-
-    def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
-                 executor: Executor | None) -> None:
-        self.evaluator = evaluator
-        self._should_stop = should_stop
-        self._executor = executor
-        self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
-
-    def __call__(self, points: Floats, first: int, limits: Limits | None = None) -> Iterator[Evaluation]:
-        """Evaluate (k, d) points, the first with the index `first`."""
-        if self._executor is None:
-            for k, point in enumerate(points):
-                try:
-                    yield self.evaluator.evaluate(first + k, point, self._should_stop, limits)
-                except CancelledError:
-                    return
-            return
-        futures: list[Future[Evaluation]] = [
-            self._executor.submit(_evaluate_elsewhere, self._key, self.evaluator, first + k, point, limits)
-            for k, point in enumerate(points)]
-        try:
-            for future in futures:
-                while not future.done():
-                    if self._should_stop():
-                        return
-                    _wait(future)
-                if self._should_stop():
-                    return
-                yield future.result()
-        finally:
-            for future in futures:
-                future.cancel()
-
-    def residuals(self, points: Floats) -> Sequence[Floats | None]:
-        """
-        Return the residuals at (k, d) points; None where a simulation failed.
-
-        :raises CancelledError: when stopped.
-        """
-        found = [evaluation.residuals for evaluation in self(points, 0)]
-        if len(found) < len(points):
-            raise CancelledError
-        return found
-
-
-def _wait(future: Future[Evaluation]) -> None:
-    try:
-        future.exception(timeout=0.05)
-    except TimeoutError:
-        pass
-
-
-class _Here(threading.local):
-    """
-    What a worker's thread keeps: the evaluator of the calibration under way.
-
-    Its simulator is closed when another calibration begins, or the thread ends.
-    """
-
-    key = ''
-    evaluator: Evaluator
-    forget: Callable[[], object] = staticmethod(lambda: None)
-
-    def of(self, key: str, evaluator: Evaluator) -> Evaluator:
-        if key != self.key:
-            self.forget()
-            self.key, self.evaluator = key, copy.copy(evaluator)
-            self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
-        return self.evaluator
-
-
-_here = _Here()
-
-
-def _evaluate_elsewhere(key: str, evaluator: Evaluator, index: int, point: Floats,
-                        limits: Limits | None) -> Evaluation:
-    """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
-    return _here.of(key, evaluator).evaluate(index, point, limits=limits)

@@ -21,8 +21,9 @@ from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
 from dlo_calibration import findings
-from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.confirmation import Confirmation
+from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.gain import Gain
 from dlo_calibration.messages import MessageTypes
 from dlo_calibration.parameters import measured

@@ -34,10 +34,11 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import calibrate, CalibrationResult, Evaluator
+from dlo_calibration.calibration import calibrate, CalibrationResult
 from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation import Evaluator
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.trial import Trial
 from dlo_calibration.worker import hints, SimulatorFactory

@@ -48,13 +48,14 @@ from visualization_msgs.msg import MarkerArray
 
 from dlo_calibration import diagnostics, messages
 from dlo_calibration.appraiser import Appraiser
-from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.collector import KEPT, TrialCollector
 from dlo_calibration.config import Options
 from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.gain import Gain
 from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES

@@ -24,8 +24,9 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult, Evaluation, Evaluator
+from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.evaluation import Evaluation, Evaluator
 from dlo_calibration.parameters import SCALE
 from dlo_calibration.simulator import Simulator
 

@@ -25,7 +25,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from dlo_calibration import findings
-from dlo_calibration.calibration import CalibrationResult, Evaluation
+from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.score import SIMILAR, VERY_SIMILAR
 
 WIDTH = 110  # columns where the output is not a terminal

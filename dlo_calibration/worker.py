@@ -29,10 +29,11 @@ import traceback
 from typing import Callable, Iterator, Sequence, Union
 
 from dlo_calibration import pool
-from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed, Evaluation
+from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed
 from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator

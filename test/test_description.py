@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration.calibration import calibrate, Evaluator
+from dlo_calibration.calibration import calibrate
 from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.description import (
@@ -36,6 +36,7 @@ from dlo_calibration.description import (
     write_result,
 )
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation import Evaluator
 from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.search.random import RandomSearch
 

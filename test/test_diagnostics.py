@@ -23,8 +23,9 @@ from wire import wire
 
 from dlo_calibration import diagnostics
 from dlo_calibration.action import Action, Hand
-from dlo_calibration.calibration import CalibrationResult, Evaluation, ParameterEstimate
+from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
 from dlo_calibration.chain import Chain
+from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.gain import Gain
 from dlo_calibration.parameters import ParameterSpace
 from dlo_calibration.score import PointErrors

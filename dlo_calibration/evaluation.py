@@ -1,0 +1,254 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Evaluation: one parameter set tried on all trials, here or wherever an executor says.
+
+A simulator lives in the process and the thread that uses it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, Executor, Future
+import copy
+from dataclasses import dataclass, replace
+import threading
+from typing import Callable, Iterator, Mapping, Sequence
+import uuid
+import weakref
+
+import numpy as np
+
+from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.score import PointErrors, residuals, TrialScore
+from dlo_calibration.search import Search
+from dlo_calibration.simulator import Rollout, Simulator
+from dlo_calibration.trial import Trial
+from dlo_calibration.uncertainty import matters_below
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    One parameter set tried on all trials (the paper calls it a round).
+
+    :param index: 0, 1, ... in the order asked.
+    :param point: (d,) in the unit cube.
+    :param values: free parameters on the 0..100 scale.
+    :param scores: difference score of each trial, NaN of one that was skipped; empty where it failed.
+    :param errors: over all goal points; None where it failed or was abandoned.
+    :param residuals: (m,) [m]; kept for the best evaluation only.
+    :param unsettled: names of trials that never came to rest.
+    :param failure: why it failed; empty where it did not.
+    :param skipped: number of trials that were not simulated any more: one before
+        them failed, or the evaluation was abandoned, as its score was too high already.
+    """
+
+    index: int
+    point: Floats
+    values: Mapping[str, float]
+    scores: tuple[float, ...] = ()
+    errors: PointErrors | None = None
+    residuals: Floats | None = None
+    unsettled: tuple[str, ...] = ()
+    failure: str = ''
+    skipped: int = 0
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether trials were skipped because the score was too high already."""
+        return self.skipped > 0 and not self.failure
+
+    @property
+    def score(self) -> float:
+        """
+        Average difference score over the trials [cm]; infinite where it failed.
+
+        Where it was abandoned, a lower bound: no score is less than 0.
+        """
+        if self.abandoned:
+            return float(np.mean(np.nan_to_num(self.scores, nan=0.0)))
+        return float(np.mean(self.scores)) if self.scores else float('inf')
+
+
+def mean_length(trials: Sequence[Trial]) -> float:
+    """Return the mean length of the DLO as the trials begin [m]."""
+    return float(np.mean([trial.initial.length for trial in trials]))
+
+
+class Evaluator:
+    """
+    Tries parameter sets on trials.
+
+    It is pickled to worker processes and copied for worker threads: see `Simulator`.
+    """
+
+    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
+        self.trials = tuple(trials)
+        self.space = space
+        self.simulator = simulator
+        self._length = mean_length(trials)
+        self._scores = tuple(TrialScore(trial) for trial in trials)
+
+    def __copy__(self) -> Evaluator:
+        """Return one with a simulator of its own."""
+        return Evaluator(self.trials, self.space, copy.copy(self.simulator))
+
+    def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
+        """Simulate every trial with free parameters on the 0..100 scale."""
+        physical = self.space.physical(values, self._length)
+        return [self.simulator.simulate(trial, physical) for trial in self.trials]
+
+    def evaluate(self, index: int, point: Floats, should_stop: Callable[[], bool] = lambda: False,
+                 limits: Limits | None = None) -> Evaluation:
+        """
+        Try a (d,) point of the unit cube on every trial.
+
+        :param limits: None: every trial is simulated, whatever the others gave.
+        :raises CancelledError: as soon as `should_stop` says so, between trials.
+        """
+        point = frozen_array(point)
+        evaluation = Evaluation(index, point, self.space.values(point))
+        physical = self.space.physical(evaluation.values, self._length)
+        scores = np.full(len(self.trials), np.nan)
+        rollouts: dict[int, Rollout] = {}
+        for k in range(len(self.trials)) if limits is None else limits.order:
+            if should_stop():
+                raise CancelledError
+            left = len(self.trials) - len(rollouts) - 1
+            try:
+                rollouts[k] = self.simulator.simulate(self.trials[k], physical)
+            except SimulationError as error:
+                return replace(evaluation, failure=str(error), skipped=left)
+            scores[k] = self._scores[k](rollouts[k].chains)
+            evaluation = replace(
+                evaluation, scores=tuple(float(score) for score in scores), skipped=left,
+                unsettled=tuple(trial.name for j, trial in enumerate(self.trials)
+                                if j in rollouts and not all(rollouts[j].settled)))
+            if left and limits is not None and evaluation.score > limits.score:
+                return evaluation
+        residual = np.concatenate([residuals(trial, rollouts[j].chains)
+                                   for j, trial in enumerate(self.trials)])
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """
+    When evaluations are abandoned.
+
+    :param score: as soon as the score cannot be this low [cm] any more.
+    :param order: indices of the trials in the order to simulate them.
+    """
+
+    score: float
+    order: tuple[int, ...]
+
+    @classmethod
+    def of(cls, search: Search, evaluations: Sequence[Evaluation], budget: int) -> Limits | None:
+        """
+        Return what neither the search nor the result can tell from no limits; None: nothing is.
+
+        Trials that scored high so far come first, as they decide soonest.
+        """
+        complete = [one for one in evaluations if one.scores and not one.skipped]
+        score = max(search.limit, matters_below([one.score for one in complete], budget))
+        if not np.isfinite(score):
+            return None
+        mean = np.mean([one.scores for one in complete], axis=0)
+        return cls(score, tuple(int(k) for k in np.argsort(-mean, kind='stable')))
+
+
+class Everywhere:
+    """Evaluates points in order, wherever the executor says; ends early, without a word, when stopped."""
+
+    def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
+                 executor: Executor | None) -> None:
+        self.evaluator = evaluator
+        self._should_stop = should_stop
+        self._executor = executor
+        self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
+
+    def __call__(self, points: Floats, first: int, limits: Limits | None = None) -> Iterator[Evaluation]:
+        """Evaluate (k, d) points, the first with the index `first`."""
+        if self._executor is None:
+            for k, point in enumerate(points):
+                try:
+                    yield self.evaluator.evaluate(first + k, point, self._should_stop, limits)
+                except CancelledError:
+                    return
+            return
+        futures: list[Future[Evaluation]] = [
+            self._executor.submit(_evaluate_elsewhere, self._key, self.evaluator, first + k, point, limits)
+            for k, point in enumerate(points)]
+        try:
+            for future in futures:
+                while not future.done():
+                    if self._should_stop():
+                        return
+                    _wait(future)
+                if self._should_stop():
+                    return
+                yield future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def residuals(self, points: Floats) -> Sequence[Floats | None]:
+        """
+        Return the residuals at (k, d) points; None where a simulation failed.
+
+        :raises CancelledError: when stopped.
+        """
+        found = [evaluation.residuals for evaluation in self(points, 0)]
+        if len(found) < len(points):
+            raise CancelledError
+        return found
+
+
+def _wait(future: Future[Evaluation]) -> None:
+    try:
+        future.exception(timeout=0.05)
+    except TimeoutError:
+        pass
+
+
+class _Here(threading.local):
+    """
+    What a worker's thread keeps: the evaluator of the calibration under way.
+
+    Its simulator is closed when another calibration begins, or the thread ends.
+    """
+
+    key = ''
+    evaluator: Evaluator
+    forget: Callable[[], object] = staticmethod(lambda: None)
+
+    def of(self, key: str, evaluator: Evaluator) -> Evaluator:
+        if key != self.key:
+            self.forget()
+            self.key, self.evaluator = key, copy.copy(evaluator)
+            self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
+        return self.evaluator
+
+
+_here = _Here()
+
+
+def _evaluate_elsewhere(key: str, evaluator: Evaluator, index: int, point: Floats,
+                        limits: Limits | None) -> Evaluation:
+    """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
+    return _here.of(key, evaluator).evaluate(index, point, limits=limits)
