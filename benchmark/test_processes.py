@@ -104,14 +104,14 @@ import json, sys, time
 from dlo_calibration import cli
 marks = {'imports': time.time()}
 calibrate_with = cli.calibrate_with
-def watched(trials, options, make_simulator, on_evaluation, should_stop):
+def watched(trials, options, make_simulator, on_evaluation, *rest):
     marks['reading'] = time.time()
     def take(evaluation):
         marks.setdefault('first', time.time())
         marks['rounds'] = time.time()
         on_evaluation(evaluation)
     try:
-        return calibrate_with(trials, options, make_simulator, take, should_stop)
+        return calibrate_with(trials, options, make_simulator, take, *rest)
     finally:
         marks['closing'] = time.time()
 cli.calibrate_with = watched
