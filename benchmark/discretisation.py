@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.bullet import BulletSimulator
+from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.parameters import PARAMETERS
 from dlo_calibration.score import PointErrors, residuals
 
@@ -63,7 +63,7 @@ def main() -> None:
             '| worst trial, mm |',
             '|---|---|---|---|---|']
     for nodes, step, damping in CASES:
-        simulator = BulletSimulator(nodes=nodes, time_step=step)
+        simulator = CompiledSimulator(nodes=nodes, time_step=step)
         errors = []
         for properties, trials in objects:
             physical = {p.name: p.physical(p.default) for p in PARAMETERS}
