@@ -116,8 +116,8 @@ class Options:
         choices=tuple(BY_NAME))
     parts: int = _option(
         1, 'equal parts of the length that have a bending stiffness of their own; more than 1: where '
-        'flexibility is calibrated, so are stiffness_2 and so on; as many at least as calibrate names',
-        minimum=1, maximum=MOST_PARTS)
+        'flexibility is calibrated, so are stiffness_2 and so on; as many at least as calibrate names; '
+        '0: as many as predict trials that are left out better', minimum=0, maximum=MOST_PARTS)
     search: str = _option('least_squares', 'search method', choices=tuple(SEARCHES))
     evaluations: int = _option(PAPER_EVALUATIONS, "parameter sets to try at most (the paper's rounds)",
                                minimum=1, maximum=1000000)

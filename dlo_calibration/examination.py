@@ -56,6 +56,7 @@ class Examination:
         the roughness of the chains [m]; nan where they have too few points.
     :param cross_validated: mean point error of trials that were left out of the
         fit [m]; nan with one trial.
+    :param left_out: (f,) [m] mean point error of each fold of them; empty with one trial.
     :param default_error: mean point error of the default parameters [m]; nan where they fail.
     :param band: (p,) [m] how far each simulated goal point may lie elsewhere, one standard deviation.
     :param evaluations: how many parameter sets were simulated for it.
@@ -66,6 +67,7 @@ class Examination:
     regular: bool
     noise: float
     cross_validated: float
+    left_out: Floats
     default_error: float
     band: Floats
     evaluations: int
@@ -111,9 +113,8 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
             # A small difference may show a kink where there is no slope: the lesser effect is believed.
             if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
                 jacobian[:, k] = column
-    cross_validated = float('nan')
-    if len(shapes) > 1:
-        cross_validated = _cross_validated(point, residuals, jacobian, shapes, residuals_at)
+    distances = _left_out_distances(point, residuals, jacobian, shapes, residuals_at)
+    cross_validated = float(np.concatenate(distances).mean()) if distances else float('nan')
     shift = None
     if finer is not None:  # last: a worker keeps one simulator at a time
         count += 1
@@ -129,6 +130,7 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     return Examination(
         uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,
         regular=_arrived(residuals, jacobian, found), cross_validated=cross_validated,
+        left_out=frozen_array([float(fold.mean()) for fold in distances]),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
         band=frozen_array(predictive_std(jacobian, found.covariance)), evaluations=count)
 
@@ -162,9 +164,11 @@ def _arrived(residuals: Floats, jacobian: Floats, found: Uncertainty) -> bool:
     return float(gradient @ np.linalg.solve(information, gradient)) <= ARRIVED * len(free) * found.scale**2
 
 
-def _cross_validated(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]],
-                     residuals_at: Evaluate) -> float:
-    """Return the mean point error of the trials at the optima of the others [m]."""
+def _left_out_distances(point: Floats, residuals: Floats, jacobian: Floats,
+                        shapes: Sequence[tuple[int, int]], residuals_at: Evaluate) -> list[Floats]:
+    """Return the point errors [m] of each fold of the trials at the optimum of the others; none of one."""
+    if len(shapes) < 2:
+        return []
     folds = _folds(shapes)
     sizes = [sum(goals * points for goals, points in fold) for fold in folds]
     moved = left_out(residuals, jacobian, [(size, 1) for size in sizes])
@@ -174,7 +178,7 @@ def _cross_validated(point: Floats, residuals: Floats, jacobian: Floats, shapes:
         if one is not None:
             distances.append(np.linalg.norm(one[at:at + 3 * size].reshape(-1, 3), axis=1))
         at += 3 * size
-    return float(np.concatenate(distances).mean()) if distances else float('nan')
+    return distances
 
 
 def _folds(shapes: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:

@@ -81,7 +81,7 @@ class Parameter:
         return SCALE * math.log(physical / self.at_zero) / math.log(self.at_hundred / self.at_zero)
 
 
-MOST_PARTS = 6  # of a DLO, that have a bending stiffness of their own
+MOST_PARTS = 8  # of a DLO, that have a bending stiffness of their own
 
 
 def part_name(part: int) -> str:
@@ -101,7 +101,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               'radius at which parts of the DLO touch each other'),
     Parameter('damping', 'drag per mass', '1/s', 1e-2, 1e2, 50.0,
               'how fast motion through the air dies out'),
-    Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-5, 1e-1, 25.0,
+    Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-3, 1e-1, 0.0,
               'how fast bending and stretching vibrations die out (0.6 time steps at least)'),
     Parameter('mass', 'mass of the whole DLO', 'kg', 1e-3, 1e1, 42.0, 'mass of the whole DLO'),
     Parameter('length_scale', 'length at rest by the observed length', '1', 0.9, 1 / 0.9, 50.0,
@@ -193,6 +193,16 @@ class ParameterSpace:
             elif name not in free:
                 fixed.setdefault(name, BY_NAME[name].default)
         return ParameterSpace(free, fixed, self.mass)
+
+    def halved(self, point: Sequence[float] | Floats) -> tuple[ParameterSpace, NDArray[np.float64]]:
+        """Return the space with every part cut in two, and its point that is the same DLO as a (d,) point."""
+        space = self.divided(2 * self.parts)
+        values = {**self.fixed, **self.values(point)}
+        for part in range(2, space.parts + 1):
+            whole = part_name((part + 1) // 2)  # the first has no ratio: it is the measure
+            values[part_name(part)] = BY_NAME[part_name(part)].default if whole == 'flexibility' else \
+                self.fixed.get(whole, self.values(point).get(whole, BY_NAME[whole].default))
+        return space, space.point(values)
 
     @property
     def mass_known(self) -> bool:

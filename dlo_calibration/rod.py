@@ -296,3 +296,4 @@ def _stretching_places(n: int) -> tuple[Indices, Floats]:
     rows, columns = np.divmod(np.arange(9), 3)
     next_ = place(nodes[:-1] + 3 + rows, nodes[:-1] + columns).ravel()
     return np.concatenate([same, next_]), np.concatenate([np.ones(len(same)), -np.ones(len(next_))])
+PHASE0 = None

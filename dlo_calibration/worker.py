@@ -35,6 +35,7 @@ from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.slices import cut, Slices
@@ -106,7 +107,8 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         simulator = stack.enter_context(closing(make_simulator(options)))
         if executor is not None:
             simulator.prepare()
-        result = calibrate(
+        fitted = calibrate if options.parts else calibrate_parts
+        result = fitted(
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
         result = _noted(advised(result, simulator, should_stop), guessed)
@@ -237,7 +239,7 @@ class Progress:
         if self.best is None or not good:
             return {}
         return {name: math.sqrt(sum((one.values[name] - value)**2 for one in good) / len(good))
-                for name, value in self.best.values.items()}
+                for name, value in self.best.values.items() if all(name in one.values for one in good)}
 
     @property
     def simulations_per_second(self) -> float:

@@ -30,7 +30,7 @@ ORDER = (
     # pure NumPy and SciPy
     'errors', 'samples', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
-    'search', 'confirmation', 'uncertainty', 'evaluation', 'examination', 'advice', 'calibration',
+    'search', 'confirmation', 'uncertainty', 'evaluation', 'examination', 'advice', 'calibration', 'parts',
     '__init__', 'config', 'parameter_file', 'gain', 'findings', 'slices',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',

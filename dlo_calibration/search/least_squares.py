@@ -107,7 +107,7 @@ class LeastSquares(PlannedSearch):
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
         found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
-        while found < 2 and checks < MOST_CHECKS:
+        while found < 2 and checks < MOST_CHECKS and not self._hints.found:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
             if not best.ended and not best.rivals(starts):
                 best = yield from self._descend(best, None, ())
@@ -167,6 +167,10 @@ class LeastSquares(PlannedSearch):
         count = 2 ** int(np.ceil(np.log2(max(FEWEST_STARTS, STARTS_PER_PARAMETER * self._dimension))))
         sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
         hint = np.clip(self._hints.start, 0, 1)
+        if self._hints.found:
+            observations = yield hint[None, :]
+            if observations[0].residuals is not None:
+                return list(observations)
         while True:
             points = sobol.random(count)
             # Half of them keep to the estimate: where it is good it saves a lot, where it is wrong not all.

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Sequence
 
 import numpy as np
@@ -53,6 +53,7 @@ class Hints:
     :param rows: how many residuals each of T trials has, in order; empty where
         that is not known.
     :param excites: (T, d) True where a trial excites a parameter.
+    :param found: `start` is where a search of a simpler model ended: no other start is worth a try.
     """
 
     start: Floats
@@ -60,6 +61,7 @@ class Hints:
     upper: Floats
     rows: tuple[int, ...]
     excites: NDArray[np.bool_]
+    found: bool = False
 
     def __post_init__(self) -> None:
         for name in ('start', 'lower', 'upper'):
@@ -73,6 +75,11 @@ class Hints:
         """Return hints that tell nothing."""
         blank = np.zeros(dimension)
         return cls(blank * np.nan, blank, blank + 1, (), np.zeros((0, dimension), dtype=np.bool_))
+
+    @classmethod
+    def at(cls, start: Floats) -> Hints:
+        """Return hints that (d,) `start` is where a search of a simpler model ended."""
+        return replace(cls.none(len(start)), start=start, found=True)
 
     @property
     def excited(self) -> NDArray[np.bool_]:

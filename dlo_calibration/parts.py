@@ -1,0 +1,136 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parts: a DLO of as many parts, each with a bending stiffness of its own, as the trials support."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import replace
+import math
+from typing import Callable, Sequence
+
+import numpy as np
+
+from dlo_calibration.calibration import calibrate, CalibrationResult
+from dlo_calibration.chain import frozen_array
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation import Evaluation
+from dlo_calibration.parameters import MOST_PARTS, ParameterSpace
+from dlo_calibration.search import Hints, LeastSquares, Search
+from dlo_calibration.simulator import Simulator
+from dlo_calibration.trial import Trial
+
+FIRST_SHARE = 0.5  # of the budget, that may go into the DLO that is even
+FEWEST_LEFT = 3  # evaluations for each parameter, without which no more parts are tried
+MOST_FAILURES = 2  # in a row: a DLO that is stiff in the middle alone needs four parts to show it
+EXACT = 1e-6  # m; errors below it are none
+WORTHWHILE = 0.02  # share by which more parts lower the error of trials that are left out
+
+
+def calibrate_parts(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, search: Search, *,
+                    budget: int,
+                    on_evaluation: Callable[[Evaluation], None] | None = None,
+                    should_stop: Callable[[], bool] = lambda: False,
+                    executor: Executor | None = None,
+                    seed: int | None = None) -> CalibrationResult:
+    """
+    Calibrate an even DLO, then cut every part in two as long as that predicts better.
+
+    What it must predict is each trial from the others (the cross-validated error of
+    `examination`; Stone, Cross-validatory choice, 1974), so that parts which only fit
+    noise are not kept.  More parts begin where fewer ended, by least squares.  All
+    evaluations count in the budget; `CalibrationResult.evaluations` has those of what
+    was tried and not kept, too.
+
+    The parameters are those of `calibration.calibrate`.
+    """
+    taken: list[tuple[ParameterSpace, Evaluation]] = []
+
+    def fitted(space: ParameterSpace, search: Search, budget: int) -> CalibrationResult:
+        def take(evaluation: Evaluation) -> None:
+            evaluation = replace(evaluation, index=len(taken))
+            taken.append((space, replace(evaluation, residuals=None)))
+            if on_evaluation is not None:
+                on_evaluation(evaluation)
+
+        return calibrate(trials, space, simulator, search, budget=budget, on_evaluation=take,
+                         should_stop=should_stop, executor=executor, seed=seed)
+
+    if not _divisible(trials, space):
+        return fitted(space, search, budget)
+    best = latest = fitted(space, search, max(1, math.ceil(FIRST_SHARE * budget)))
+    seconds, examined, failures, why = best.seconds, _examined(best), 0, ''
+    while _examined(latest) and 2 * latest.space.parts <= MOST_PARTS and failures < MOST_FAILURES:
+        finer, start = latest.space.halved(latest.best.point)
+        first = len(taken)
+        if budget - first < FEWEST_LEFT * finer.dimension:
+            why = f'the budget of {budget} evaluations is too small to try {finer.parts}'
+            break
+        try:
+            latest = fitted(finer, LeastSquares(finer.dimension, 0, Hints.at(start)), budget - first)
+        except SimulationError:  # those before stand
+            why = f'{finer.parts} could not be simulated'
+            break
+        latest = replace(latest, best=replace(latest.best, index=first + latest.best.index))
+        seconds += latest.seconds
+        examined += _examined(latest)
+        if not _examined(latest):
+            why = f'stopped before {finer.parts} were fitted'
+        elif _better(latest, best):
+            best, failures, why = latest, 0, ''
+        else:
+            failures += 1
+            why = f'{finer.parts} would not predict left-out trials better'
+    count = best.space.parts
+    reason = f'{best.stop_reason}; {count} part{"s" * (count > 1)}' + f': {why}' * bool(why)
+    examination = best.examination and replace(best.examination, evaluations=examined)
+    evaluations = tuple(_restated(evaluation, tried, best.space) for tried, evaluation in taken)
+    return replace(best, evaluations=evaluations, seconds=seconds, stop_reason=reason,
+                   examination=examination)
+
+
+def _divisible(trials: Sequence[Trial], space: ParameterSpace) -> bool:
+    return len(trials) > 1 and 'flexibility' in space.free
+
+
+def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpace) -> Evaluation:
+    """Return an evaluation in another space: the same DLO where that has more parts, else what both name."""
+    point = evaluation.point
+    while tried.parts < space.parts:
+        tried, point = tried.halved(point)
+    values = tried.values(point)
+    return replace(evaluation, point=frozen_array(space.point(values)),
+                   values={name: values[name] for name in space.free})
+
+
+def _examined(result: CalibrationResult) -> int:
+    """Return how many parameter sets were examined; 0 where it was stopped before that."""
+    return 0 if result.examination is None else result.examination.evaluations
+
+
+def _better(other: CalibrationResult, best: CalibrationResult) -> bool:
+    """
+    Tell whether a result predicts left-out trials better, by more than they differ in that.
+
+    That is the rule of one standard error (Breiman et al., Classification and Regression
+    Trees, 1984, 3.4.3), for the logarithm of the error: a trial that is hard to predict counts as one.
+    """
+    if other.examination is None or best.examination is None:
+        return False
+    before, after = best.examination.left_out, other.examination.left_out
+    if len(before) < 2 or len(before) != len(after):
+        return False
+    gains = np.log(np.maximum(before, EXACT) / np.maximum(after, EXACT))
+    return float(gains.mean()) > max(WORTHWHILE, float(gains.std(ddof=1)) / math.sqrt(len(gains)))

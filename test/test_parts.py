@@ -1,0 +1,128 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parts: as many as the trials support, no more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dlo_calibration.action import Action, Hand
+from dlo_calibration.chain import Chain
+from dlo_calibration.compiled import CompiledSimulator
+from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.parts import calibrate_parts
+from dlo_calibration.search import Hints, LeastSquares
+from dlo_calibration.trial import Goal, Trial
+
+POINTS, LENGTH = 15, 0.8
+EVEN = ParameterSpace(('flexibility', 'damping'))
+TRUTH = {'flexibility': 40.0, 'damping': 50.0}
+STIFF_MIDDLE = {**TRUTH, 'stiffness_2': 68.0, 'stiffness_3': 68.0, 'stiffness_4': 50.0}
+NAMES = ('left_hand', 'right_hand')
+
+
+def carried(turn, lift):
+    """Return a trial of a DLO held in two clamps that sags while they carry it about."""
+    arc = np.linspace(0, LENGTH, POINTS)
+    points = np.stack([arc, 0 * arc, 1 + 0 * arc], axis=1)
+    times = np.array([0.0, 0.6, 1.2])
+    right = points[-1] + [[0, 0, 0], [-0.3, turn, lift], [-0.3, -turn, 0]]
+    left = points[0] + [[0, 0, 0], [0, 0, -lift], [0, turn, 0]]
+    hands = (Hand(NAMES[0], (0, 1), times, left), Hand(NAMES[1], (POINTS - 1, POINTS - 2), times, right))
+    goals = tuple(Goal(Chain(points), time, stable=False, held_by=NAMES) for time in np.arange(0.1, 1.6, 0.1))
+    return Trial(f'{turn:g} {lift:g}', Chain(points), (Action(hands),), goals)
+
+
+def observed(space, values):
+    """Return four trials of a DLO with these values, with half a millimetre of noise in what follows."""
+    trials = [carried(0.1, 0.2), carried(0.25, 0.0), carried(-0.1, 0.3), carried(0.0, -0.2)]
+    noise = np.random.default_rng(4)
+    rollouts = Evaluator(trials, space, CompiledSimulator(table=False)).simulate(values)
+    return [replace(trial, goals=tuple(
+        replace(goal, chain=Chain(points + noise.normal(0, 5e-4, points.shape)))
+        for goal, points in zip(trial.goals, rollout.chains, strict=True)))
+        for trial, rollout in zip(trials, rollouts, strict=True)]
+
+
+def calibrated(trials, budget=200, **options):
+    search = LeastSquares(EVEN.dimension, 1, Hints.none(EVEN.dimension))
+    return calibrate_parts(trials, EVEN, CompiledSimulator(table=False), search, budget=budget, **options)
+
+
+@pytest.fixture(scope='module')
+def stiff_middle():
+    return observed(EVEN.divided(4), STIFF_MIDDLE)
+
+
+@pytest.fixture(scope='module')
+def found(stiff_middle):
+    seen = []
+    return calibrated(stiff_middle, on_evaluation=seen.append), seen
+
+
+def test_a_dlo_that_is_stiffer_in_the_middle_gets_four_parts(found):
+    # In two parts it looks even: only four show it.
+    result, _ = found
+    assert result.space.parts == 4
+    for name, value in STIFF_MIDDLE.items():
+        assert result.values[name] == pytest.approx(value, abs=1.5), name
+    assert result.stop_reason.endswith('4 parts: 8 would not predict left-out trials better')
+    assert result.errors.mean < 1e-3
+
+
+def test_every_evaluation_is_counted_and_told_in_the_parts_that_were_found(found):
+    result, seen = found
+    assert [one.index for one in result.evaluations] == [one.index for one in seen] == list(range(len(seen)))
+    assert len(seen) <= 200
+    assert {tuple(one.values) for one in result.evaluations} == {result.space.free}
+    first = result.evaluations[0].values  # of the even DLO
+    assert [first[f'stiffness_{part}'] for part in (2, 3, 4)] == [50, 50, 50]
+    assert result.simulations > len(seen) * 4
+
+
+def test_the_same_in_parts_is_the_same_dlo(found):
+    result, seen = found
+    even = result.evaluations[0]
+    again = Evaluator(result.trials, result.space, CompiledSimulator(table=False)).evaluate(0, even.point)
+    assert again.score == pytest.approx(seen[even.index].score, rel=1e-6)
+
+
+def test_an_even_dlo_stays_in_one_part():
+    result = calibrated(observed(EVEN, TRUTH))
+    assert result.space == EVEN
+    assert result.values == pytest.approx(TRUTH, abs=1.0)
+    assert '1 part: 4 would not predict left-out trials better' in result.stop_reason
+
+
+def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):
+    result = calibrated(stiff_middle, budget=16)
+    assert result.space == EVEN
+    assert len(result.evaluations) <= 16
+    assert result.stop_reason.endswith('1 part: the budget of 16 evaluations is too small to try 2')
+
+
+def test_without_a_second_trial_nothing_can_be_left_out(stiff_middle):
+    assert calibrated(stiff_middle[:1], budget=30).space == EVEN
+
+
+def test_a_stop_keeps_the_parts_that_were_found(stiff_middle, found):
+    even = next(k for k, one in enumerate(found[1]) if 'stiffness_2' in one.values)
+    seen = []
+    result = calibrated(stiff_middle, on_evaluation=seen.append, should_stop=lambda: len(seen) > even + 3)
+    assert result.space == EVEN
+    assert len(result.evaluations) == len(seen) == even + 4
+    assert result.stop_reason.endswith('1 part: stopped before 2 were fitted')
