@@ -39,6 +39,7 @@ from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.trial import Trial
 from dlo_calibration.worker import hints, SimulatorFactory
@@ -201,8 +202,9 @@ def perform(task: Task, make_simulator: SimulatorFactory,
     search = SEARCHES[task.search](options.space.dimension, task.seed, hints(trials, options))
     with closing(make_simulator(options)) as simulator:
         try:
-            result = calibrate(trials, options.space, simulator, search, budget=options.evaluations,
-                               seed=task.seed, should_stop=should_stop)
+            fitted = calibrate if options.parts else calibrate_parts
+            result = fitted(trials, options.space, simulator, search, budget=options.evaluations,
+                            seed=task.seed, should_stop=should_stop)
         except SimulationError as error:
             if should_stop():
                 raise CancelledError from error
