@@ -61,8 +61,8 @@ class Layout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 
-        The initial chain is smoothed as far as the noise of the trial's chains
-        goes: noise makes a chain longer, and bends a stiff one as nothing real does.
+        The initial chain is smoothed as the noise of the trial's chains asks
+        for: noise makes a chain longer, and bends a stiff one as nothing real does.
 
         :raises InputError: where more points are gripped than there can be nodes.
         """
@@ -104,8 +104,7 @@ def _without_noise(trial: Trial) -> Chain:
     sigma = noise([trial])
     if not sigma > 0:
         return trial.initial
-    points = smooth(trial.initial.points, trial.initial.arc_lengths(), sigma)
-    return replace(trial.initial, points=points)
+    return replace(trial.initial, points=smooth(trial.initial.points, sigma))
 
 
 def spread_places(fixed: Floats, count: int) -> Floats:
