@@ -29,7 +29,7 @@ from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, Limits, mean_length
 from dlo_calibration.examination import Examination, examine
-from dlo_calibration.noise import noise, smooth
+from dlo_calibration.noise import NO_NOISE, noise, smooth
 from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
@@ -38,7 +38,6 @@ from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
-EXACT = 1e-6  # m, of noise that moves nothing
 STARTS = 16  # initial chains that are simulated with other noise, over all trials
 
 
@@ -235,7 +234,7 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
             best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
             evaluate.residuals, default=default, noise=sigma,
             finer=None if finer is None else everywhere(Evaluator(trials, space, finer)).residuals,
-            starts=[] if not sigma > EXACT or 'length_scale' in space.free else [
+            starts=[] if not sigma > NO_NOISE or 'length_scale' in space.free else [
                 everywhere(Evaluator(others, space, simulator)).residuals
                 for others in _other_starts(trials, sigma)])
     finally:

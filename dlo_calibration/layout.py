@@ -23,7 +23,7 @@ import numpy as np
 from dlo_calibration.action import Hand
 from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
 from dlo_calibration.errors import InputError
-from dlo_calibration.noise import noise, smooth
+from dlo_calibration.noise import NO_NOISE, noise, smooth
 from dlo_calibration.trial import Trial
 
 RESTING_BAND = 0.006  # m; points of a resting chain are that near to its lowest one
@@ -102,7 +102,7 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
 def _without_noise(trial: Trial) -> Chain:
     """Return the initial chain, smoothed."""
     sigma = noise([trial])
-    if not sigma > 0:
+    if not sigma > NO_NOISE:
         return trial.initial
     return replace(trial.initial, points=smooth(trial.initial.points, sigma))
 

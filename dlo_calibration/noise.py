@@ -27,6 +27,7 @@ from dlo_calibration.trial import Trial
 ORDERS = range(2, 9)  # of the differences; more do not separate curve and noise any better
 FEWEST_POINTS = 5  # of a chain that tells bending from noise
 SMOOTHING = np.logspace(-8, 8, 161)  # weights of the roughness of a curve that are tried
+NO_NOISE = 1e-6  # m; less moves nothing
 KINK = 8.0  # times the median square: more than noise; 99.9 % of white noise in space is below
 
 

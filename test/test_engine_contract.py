@@ -264,7 +264,7 @@ def test_a_repeat_is_bit_exact_in_another_process(make):
     code = ('import sys; sys.path[:0] = sys.argv[1:3]\n'
             'from test_engine_contract import *\n'
             'make = next(factory for factory in FACTORIES if factory.name == sys.argv[3])\n'
-            'print(digest(rollout(make(**SMALL))))')
+            'print(digest(rollout(make(**{"nodes": NODES, "time_step": TIME_STEP, **SMALL}))))')
     folder = Path(__file__).parent
     printed = subprocess.run([sys.executable, '-c', code, str(folder), str(folder.parent), here.name],
                              capture_output=True, text=True, check=True).stdout
