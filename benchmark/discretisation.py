@@ -38,7 +38,8 @@ from dlo_calibration.score import PointErrors, residuals
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data')) / 'reference'
 #: nodes, time step [s], internal damping [s] (None: the default)
-CASES = ((31, 0.004, None), (31, 0.004, 0.004), (31, 0.008, None), (31, 0.002, None),
+CASES = ((41, 0.003, None), (41, 0.004, None), (41, 0.002, None),
+         (31, 0.004, None), (31, 0.004, 0.004), (31, 0.008, None), (31, 0.002, None),
          (61, 0.004, None), (61, 0.002, None), (61, 0.001, None))
 
 

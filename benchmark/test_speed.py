@@ -59,7 +59,7 @@ def tables():
         f'From {NODES[0]} to {NODES[-1]} nodes the time of a step grows with the nodes to the power of '
         f'{growth[0]:.2f} (bullet) and {growth[1]:.2f} (compiled; {last:.2f} from {NODES[-2]} to '
         f'{NODES[-1]}).',
-        table(['trial, 31 nodes', 'bullet, ms', 'compiled, ms', 'ratio', 'steps'], trials),
+        table(['trial, 41 nodes', 'bullet, ms', 'compiled, ms', 'ratio', 'steps'], trials),
         'What a compiled round is spent on, in µs:',
         table(['nodes', 'whole', 'Python', 'table of distances', 'self-contact', 'rod and table',
                'Python, share', 'self-contact, share'], parts)]))

@@ -62,8 +62,8 @@ def _silence() -> Iterator[None]:
 with _silence():  # it greets every process with its build time, in the middle of a progress bar
     import pybullet
 
-DEFAULT_NODES = 31
-DEFAULT_TIME_STEP = 0.004  # s
+DEFAULT_NODES = 41
+DEFAULT_TIME_STEP = 0.003  # s
 ROPE_GROUP = 1 << 6  # collision group whose members do not collide with each other in Bullet
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 INERTIA = 1e6  # kg m^2: spheres slide, they do not roll

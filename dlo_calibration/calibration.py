@@ -24,12 +24,12 @@ from typing import Callable, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.advice import Advice, advise
-from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, Limits, mean_length
 from dlo_calibration.examination import Examination, examine
-from dlo_calibration.noise import noise
+from dlo_calibration.noise import NO_NOISE, noise, smooth
 from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
@@ -38,8 +38,7 @@ from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 
 PAPER_EVALUATIONS = 150
-EXACT = 1e-9  # relative error of a length that does not matter
-LENGTH_ENDS = float(np.sqrt(2.0))  # standard deviation of a length, in those of its two ends
+STARTS = 16  # initial chains that are simulated with other noise, over all trials
 
 
 @dataclass(frozen=True)
@@ -230,14 +229,14 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
     assert best.residuals is not None
     default, sigma = space.default_point(), noise(trials)
     finer = simulator.refined()
-    error = LENGTH_ENDS * sigma / mean_length(trials)  # of the measured length, relative
     try:
         examination = examine(
             best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
             evaluate.residuals, default=default, noise=sigma,
             finer=None if finer is None else everywhere(Evaluator(trials, space, finer)).residuals,
-            longer=None if not error > EXACT or 'length_scale' in space.free else everywhere(
-                Evaluator(trials, space.lengthened(1 + error), simulator)).residuals)
+            starts=[] if not sigma > NO_NOISE or 'length_scale' in space.free else [
+                everywhere(Evaluator(others, space, simulator)).residuals
+                for others in _other_starts(trials, sigma)])
     finally:
         if finer is not None:
             finer.close()
@@ -249,6 +248,25 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
     if again is None:
         raise CancelledError
     return replace(examination, evaluations=examination.evaluations + 1), best if again.failure else again
+
+
+def _other_starts(trials: Sequence[Trial], sigma: float) -> list[list[Trial]]:
+    """
+    Return copies of the trials whose initial chains have other noise, a few if there are many trials.
+
+    It is drawn anew onto the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
+    Introduction to the Bootstrap, 1993, 6.5); the same draws each time.
+
+    :param sigma: standard deviation of a coordinate [m].
+    """
+    generator = np.random.default_rng(0)
+
+    def drawn(initial: Chain) -> Chain:
+        points = smooth(initial.points, sigma)
+        return replace(initial, points=points + generator.normal(0, sigma, points.shape))
+
+    return [[replace(trial, initial=drawn(trial.initial)) for trial in trials]
+            for _ in range(-(-STARTS // len(trials)))]
 
 
 def confirmed(result: CalibrationResult, simulator: Simulator,

@@ -130,8 +130,8 @@ class CompiledSimulator:
 
     name = 'compiled'
 
-    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = 31,
-                 time_step: float = 0.004, stable_distance: float = Settling.distance,
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = 41,
+                 time_step: float = 0.003, stable_distance: float = Settling.distance,
                  stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
         self._table_height = table_height if table else None
         self._nodes = nodes

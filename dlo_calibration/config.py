@@ -128,8 +128,8 @@ class Options:
     scheduler: str = _option(
         '', 'address of a Dask scheduler whose workers simulate, on any number of machines, e.g. '
         'tcp://host:8786; workers has no effect then; empty: this machine alone')
-    nodes: int = _option(31, 'point masses of the simulated DLO', minimum=8, maximum=1000)
-    time_step: float = _option(0.004, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
+    nodes: int = _option(41, 'point masses of the simulated DLO', minimum=8, maximum=1000)
+    time_step: float = _option(0.003, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
     stable_distance: float = _option(
         0.0005, 'a DLO is stable when all its points moved less than this within stable_time',
         unit='m', minimum=1e-6, maximum=0.1)

@@ -24,8 +24,8 @@ import numpy as np
 from dlo_calibration.chain import Floats
 from dlo_calibration.score import PointErrors
 
-#: Mean distance [m] between two engines' points of a trial from which on they disagree: less than the
-#: error of nodes and time step themselves, 0.8 mm on the reference objects (doc/physics.md).
+#: Mean distance [m] between two engines' points of a trial from which on they disagree: about the
+#: error of nodes and time step themselves, 0.43 mm on the reference objects (doc/physics.md).
 DISTANCE_TOLERANCE = 0.5e-3
 #: A score may differ by that share of it, and by that much [cm]: less than that decides between no two sets.
 SCORE_SHARE, SCORE_TOLERANCE = 0.05, 0.1

@@ -170,7 +170,7 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) 
 
 def _smoothed(chain: Chain, sigma: float) -> Chain:
     """Return a chain without as much of its roughness as is noise."""
-    smoothed = smooth(chain.points, chain.arc_lengths(), SMOOTHER * sigma)
+    smoothed = smooth(chain.points, SMOOTHER * sigma)
     steps = np.linalg.norm(np.diff(smoothed, axis=0), axis=1)
     return Chain(smoothed) if (steps > MINIMUM_SPACING).all() else chain
 

@@ -16,25 +16,35 @@
 Examination: what is looked at around the found parameters, once a search has ended.
 
 Beside the found point, each parameter is moved both ways; a finer simulation,
-the default parameters, and the optima without one trial after the other are
-simulated.  What that says about uncertainty is in `uncertainty`.
+other draws of the noise of the initial chains, the default parameters, the optima
+without one trial after the other, and the ends of wide intervals are simulated.
+What that says about uncertainty is in `uncertainty`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Callable, Sequence
 
 import numpy as np
 
 from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.score import PointErrors
-from dlo_calibration.uncertainty import from_jacobian, left_out, optimum_shift, predictive_std, Uncertainty
+from dlo_calibration.uncertainty import (
+    DEVIATIONS,
+    from_jacobian,
+    left_out,
+    optimum_shift,
+    predictive_std,
+    Uncertainty,
+)
 
 STEP = 0.03  # of the central differences, in the unit cube; contacts that come and go are smaller
 SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:
 WIDE, WIDEST = 0.1, 0.25  # as far as it is unknown, within these
 WIDENINGS = 2
+FADED = 0.9  # of the effect that the end of an interval should have: less, and the end is further away
+DOUBLINGS = 4  # of the way there; then it may be anywhere on the scale
 OUTLIER = 1.5  # standard deviations at which residuals are cut off
 ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
 MOST_FOLDS = 8  # of the cross-validation
@@ -75,7 +85,7 @@ class Examination:
 
 def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]], evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Evaluate | None = None,
-            longer: Evaluate | None = None) -> Examination:
+            starts: Sequence[Evaluate] = ()) -> Examination:
     """
     Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
 
@@ -83,8 +93,7 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     :param default: (d,) the default parameters.
     :param noise: see `Examination`.
     :param finer: simulates with more nodes and a smaller step; None: not examined.
-    :param longer: simulates a DLO that is longer by the standard deviation of
-        its measured length; None: not examined.
+    :param starts: simulate with other draws of the noise of the initial chains; may be none.
     """
     count = 0
 
@@ -120,12 +129,11 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
         count += 1
         fine, = finer(point[None, :])
         shift = np.ones(dimension) if fine is None else optimum_shift(residuals, fine, jacobian)
-    length = None
-    if longer is not None:
-        count += 1
-        stretched, = longer(point[None, :])
-        length = None if stretched is None else stretched - residuals
-    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift, length=length)
+    drawn = [one for start in starts for one in start(point[None, :])]
+    count += len(drawn)
+    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift,
+                          starts=[one for one in drawn if one is not None])
+    found = _reaching(point, residuals, jacobian, found, residuals_at)
     assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,
@@ -133,6 +141,46 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
         left_out=frozen_array([float(fold.mean()) for fold in distances]),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
         band=frozen_array(predictive_std(jacobian, found.covariance)), evaluations=count)
+
+
+def _reaching(point: Floats, residuals: Floats, jacobian: Floats, found: Uncertainty,
+              residuals_at: Evaluate) -> Uncertainty:
+    """
+    Return intervals that reach to where the residuals have really changed enough, and not less.
+
+    The effect of a stiffness fades as it grows: what is a clear loss on one side may be none on the other.
+    """
+    ends, limits = np.stack([found.lower, found.upper]), (0.0, 1.0)
+    excited = np.flatnonzero(found.excited)
+    needed = DEVIATIONS * found.std * FADED
+    unsure = [(side, int(k)) for k in excited for side in (0, 1)
+              if found.std[k] > SUSPECT and ends[side, k] != limits[side]]
+    for _ in range(DOUBLINGS):
+        if not unsure:
+            break
+        there = np.tile(point, (len(unsure), 1))
+        for row, (side, k) in zip(there, unsure, strict=True):
+            row[k] = ends[side, k]
+        still = []
+        for (side, k), one in zip(unsure, residuals_at(there), strict=True):
+            if one is None:
+                continue
+            own = _own_part(jacobian[:, excited], int(np.searchsorted(excited, k)))
+            if abs(float(own @ (one - residuals))) < needed[k]:
+                ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits)
+                if ends[side, k] != limits[side]:
+                    still.append((side, k))
+        unsure = still
+    for side, k in unsure:
+        ends[side, k] = limits[side]
+    return replace(found, lower=frozen_array(ends[0]), upper=frozen_array(ends[1]))
+
+
+def _own_part(jacobian: Floats, k: int) -> Floats:
+    """Return (m,) weights of a change of the residuals that tell how far k moved, not the others."""
+    others = np.delete(jacobian, k, axis=1)
+    own = jacobian[:, k] - others @ np.linalg.lstsq(others, jacobian[:, k], rcond=None)[0]
+    return np.asarray(own / max(float(own @ own), 1e-300))
 
 
 def _beside(point: Floats, k: int | np.intp, step: float) -> Floats:

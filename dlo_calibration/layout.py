@@ -23,7 +23,7 @@ import numpy as np
 from dlo_calibration.action import Hand
 from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
 from dlo_calibration.errors import InputError
-from dlo_calibration.noise import noise, smooth
+from dlo_calibration.noise import NO_NOISE, noise, smooth
 from dlo_calibration.trial import Trial
 
 RESTING_BAND = 0.006  # m; points of a resting chain are that near to its lowest one
@@ -61,8 +61,8 @@ class Layout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 
-        The initial chain is smoothed as far as the noise of the trial's chains
-        goes: noise makes a chain longer, and bends a stiff one as nothing real does.
+        The initial chain is smoothed as the noise of the trial's chains asks
+        for: noise makes a chain longer, and bends a stiff one as nothing real does.
 
         :raises InputError: where more points are gripped than there can be nodes.
         """
@@ -102,10 +102,9 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
 def _without_noise(trial: Trial) -> Chain:
     """Return the initial chain, smoothed."""
     sigma = noise([trial])
-    if not sigma > 0:
+    if not sigma > NO_NOISE:
         return trial.initial
-    points = smooth(trial.initial.points, trial.initial.arc_lengths(), sigma)
-    return replace(trial.initial, points=points)
+    return replace(trial.initial, points=smooth(trial.initial.points, sigma))
 
 
 def spread_places(fixed: Floats, count: int) -> Floats:

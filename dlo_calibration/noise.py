@@ -26,6 +26,8 @@ from dlo_calibration.trial import Trial
 
 ORDERS = range(2, 9)  # of the differences; more do not separate curve and noise any better
 FEWEST_POINTS = 5  # of a chain that tells bending from noise
+SMOOTHING = np.logspace(-8, 8, 161)  # weights of the roughness of a curve that are tried
+NO_NOISE = 1e-6  # m; less moves nothing
 KINK = 8.0  # times the median square: more than noise; 99.9 % of white noise in space is below
 
 
@@ -99,29 +101,43 @@ def _smallest(squares: dict[int, list[Floats]]) -> float:
     return float(np.sqrt(min(estimates))) if estimates else float('nan')
 
 
-def smooth(points: Floats, places: Floats, noise: float) -> Floats:
+def smooth(points: Floats, noise: float) -> Floats:
     """
-    Return the smoothest points that the noise allows, (n, 3) [m].
+    Return points with as much of their noise taken away as the curve allows, (n, 3) [m].
 
-    Third differences are kept small as far as the points stay within the noise
-    (Reinsch, Smoothing by Spline Functions, 1967, in the discrete form of Whittaker, 1923).
+    Third differences are made small (Whittaker, On a New Method of Graduation, 1923), with the weight
+    that makes the expected distance from the truth smallest (Mallows, Some Comments on Cp, 1973):
+    what is missed of the points, and twice the noise that is kept.
 
     :param points: (n, 3) [m].
-    :param places: (n,) [m] along the DLO.
     :param noise: standard deviation of a coordinate [m].
     """
+    places = places_along(points, noise)
     weights = np.eye(len(points))
-    spread = places / (places[-1] - places[0]) * (len(points) - 1)
+    spread = places / places[-1] * (len(points) - 1)
     for order in range(1, min(4, len(points))):
         weights = np.diff(weights, axis=0) / (spread[order:] - spread[:-order])[:, None]
     stiffness, modes = np.linalg.eigh(weights.T @ weights)
     parts = modes.T @ points
-    low, high = -6.0, 8.0  # decimal logarithm of the smoothing
-    for _ in range(30):
-        middle = (low + high) / 2
-        kept = 1 / (1 + 10**middle * np.maximum(stiffness, 0))
-        missed = np.sum(((1 - kept)[:, None] * parts)**2)
-        allowed = 3 * noise**2 * np.sum((1 - kept)**2)
-        low, high = (low, middle) if missed > allowed else (middle, high)
-    kept = 1 / (1 + 10**low * np.maximum(stiffness, 0))
-    return np.asarray(modes @ (kept[:, None] * parts))
+    kept = 1 / (1 + SMOOTHING[:, None] * np.maximum(stiffness, 0))
+    risk = (1 - kept)**2 @ np.sum(parts**2, axis=1) + 2 * 3 * noise**2 * kept.sum(axis=1)
+    return np.asarray(modes @ (kept[np.argmin(risk)][:, None] * parts))
+
+
+def places_along(points: Floats, noise: float) -> Floats:
+    """
+    Return where points lie along their DLO, without what noise does to their spacing, (n,) [m] from 0.
+
+    Distances of neighbours go towards their mean as far as noise explains how they scatter
+    (James and Stein, Estimation with Quadratic Loss, 1961, no further than the mean itself):
+    points that differ from even ones by noise become even, and others stay.
+
+    :param points: (n, 3) [m].
+    :param noise: standard deviation of a coordinate [m].
+    """
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    mean, count = steps.mean(), len(steps)
+    scatter = np.sum((steps - mean)**2)
+    explained = 2 * noise**2 * (count - 1 / count)  # a step has the noise of two points, and so has their sum
+    share = max(0.0, 1 - explained / scatter) if scatter > 0 else 0.0
+    return np.concatenate([[0.0], np.cumsum(mean + share * (steps - mean))])

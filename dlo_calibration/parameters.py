@@ -22,7 +22,7 @@ an engine reads its physical value by name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 from typing import Mapping, Sequence
 
@@ -216,13 +216,6 @@ class ParameterSpace:
     def point(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the (d,) point of the unit cube of free parameters on 0..100."""
         return np.array([values[name] / SCALE for name in self.free])
-
-    def lengthened(self, factor: float) -> ParameterSpace:
-        """Return the same with a fixed `length_scale` that is larger by a factor."""
-        scale = BY_NAME['length_scale']
-        now = scale.physical(self.fixed.get('length_scale', scale.default))
-        value = min(max(scale.value(now * factor), 0.0), SCALE)
-        return replace(self, fixed={**self.fixed, 'length_scale': value})
 
     def default_point(self) -> NDArray[np.float64]:
         """Return the (d,) point of the unit cube where nothing is found: what is fixed, else the default."""

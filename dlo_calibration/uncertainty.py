@@ -20,7 +20,7 @@ Jacobian of the residuals there.  Four things are added to what a textbook's
 formula says, because alone it is several times too small for real DLOs:
 
 - neighbouring points err alike, so that they count as fewer;
-- the initial chain of each trial is measured, too, and with it the length of the DLO;
+- the initial chain of each trial is measured, too, and with it the length and the shape of the DLO;
 - where the model cannot explain the residuals, the trials disagree with each
   other, and how far says more than how many points there are;
 - the step and the nodes of the simulation move the optimum.
@@ -162,7 +162,7 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
 
 def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], *,
                   noise: float = float('nan'), shift: Floats | None = None,
-                  length: Floats | None = None) -> Uncertainty:
+                  starts: Sequence[Floats] = ()) -> Uncertainty:
     """
     Return what the residuals and their derivatives at a minimum say.
 
@@ -172,10 +172,10 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
     :param shapes: (goals, points) of each trial.
     :param noise: standard deviation of one coordinate of the observations [m]; nan where not known.
     :param shift: (d,) how far a finer simulation moves the optimum; None: not known.
-    :param length: (m,) [m] how one standard deviation of each trial's measured length changes its
-        residuals; None: not known.
+    :param starts: (m,) [m] each, residuals there with other draws of the noise of the initial chains; may be
+        none.
     """
-    weights = _weights(residuals)
+    weights = _weights(residuals, residuals)
     right, matrix = weights * residuals, weights[:, None] * jacobian
     capped = weights**2 * residuals
     residual = float(np.sqrt(capped @ capped / CAPPED / max(1, len(residuals) - len(point))))
@@ -192,10 +192,11 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (REMAINING * shift)**2
-    if length is not None:  # each trial's own error of length moves the optimum by a Gauss-Newton step
-        pulls = [matrix[rows].T @ (weights * length)[rows] for rows in _rows(shapes)]
+    if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
+        pulls = [jacobian[rows].T @ (_weights(one, residuals)**2 * one - capped)[rows]
+                 for one in starts for rows in _rows(shapes)]
         moves = covariance @ np.array(pulls).T / scale**2
-        covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0)
+        covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0) / len(starts)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
     # None is known worse than a value that may be anything.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
@@ -278,8 +279,8 @@ def predictive_std(jacobian: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(variances.reshape(-1, 3).sum(axis=1)))
 
 
-def _weights(residuals: Floats) -> Floats:
-    """Return (m,) square roots of Huber's weights: outliers count less."""
-    scale = 1.4826 * float(np.median(np.abs(residuals)))
+def _weights(residuals: Floats, usual: Floats) -> Floats:
+    """Return (m,) square roots of Huber's weights: what is an outlier among `usual` residuals counts less."""
+    scale = 1.4826 * float(np.median(np.abs(usual)))
     sizes = np.abs(residuals) / (ROBUST * scale) if scale > 0 else np.zeros_like(residuals)
     return 1 / np.sqrt(np.maximum(sizes, 1.0))

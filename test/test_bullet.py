@@ -71,7 +71,7 @@ def test_a_rope_falls_onto_an_obstacle_of_its_world_and_rests_on_it(world):
     pybullet.createMultiBody(0, box, basePosition=[0.5, 0, 0.05], physicsClientId=world)
     rope = BulletRope.of(world, Chain(line((0, 0, 0.2), (1, 0, 0), 1.0, 11)), {**STIFF, 'flexibility': 1e-5})
     points = settle(rope)
-    assert points[15, 2] == pytest.approx(0.105, abs=2e-3)
+    assert points[len(points) // 2, 2] == pytest.approx(0.105, abs=2e-3)
     assert points[[0, -1], 2] == pytest.approx(0.005, abs=2e-3)
 
 

@@ -106,6 +106,46 @@ def test_a_value_at_the_end_of_the_scale_is_noted_at_either_end():
     assert result.parameters['flexibility'].lower == 0.0
 
 
+class Seeing(ToySimulator):
+    """It remembers the initial chains it began with."""
+
+    def __init__(self):
+        super().__init__()
+        self.starts = {}
+
+    def simulate(self, trial, physical):
+        self.starts[trial.initial.points.tobytes()] = trial
+        return super().simulate(trial, physical)
+
+
+@pytest.mark.parametrize(('count', 'more'), [(1, 16), (2, 16), (5, 20), (17, 17)])
+def test_initial_chains_with_other_noise_are_simulated_where_there_is_noise(count, more):
+    generator = np.random.default_rng(1)
+
+    def noisy(chain):
+        return replace(chain, points=chain.points + generator.normal(0, 1e-3, chain.points.shape))
+
+    exact = [toy_trial(TRUTH, f'trial {k}', n=41) for k in range(count)]
+    trials = [replace(one, initial=noisy(one.initial),
+                      goals=(replace(one.goals[0], chain=noisy(one.goals[0].chain)),)) for one in exact]
+    seen = []
+    for _ in range(2):
+        simulator = Seeing()
+        found(trials=trials, simulator=simulator, budget=20)
+        seen.append(simulator.starts)
+    assert len(seen[0]) == count + more
+    assert list(seen[0]) == list(seen[1])  # the same each time
+    others = list(seen[0].values())[count:]
+    away = [one.initial.points - exact[0].initial.points for one in others]
+    assert np.std(away) == pytest.approx(1e-3, rel=0.15)
+    assert {one.name for one in others} == {one.name for one in trials}
+    assert all(one.goals == trials[0].goals for one in others if one.name == trials[0].name)
+    smooth = Seeing()
+    still = [replace(one, goals=(Goal(one.initial, 2.0),)) for one in exact]
+    found(trials=still, simulator=smooth, budget=20)
+    assert len(smooth.starts) == 1
+
+
 def test_physical_values_beside_the_scale():
     result = found(space=ParameterSpace(mass=0.05), budget=30)
     for name, estimate in result.parameters.items():
@@ -420,8 +460,9 @@ def test_each_thread_has_a_simulator_of_its_own_until_the_next_calibration_or_it
 def test_threads_give_the_result_of_pybullet_bit_for_bit():
     bullet = pytest.importorskip('dlo_calibration.bullet')
     trials = [replace(trial, goals=(Goal(trial.goals[0].chain, 1.6),)) for trial in TRIALS]
-    here = found(trials=trials, simulator=bullet.BulletSimulator(settle_limit=0.5), budget=6)
+    quick = {'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.5}
+    here = found(trials=trials, simulator=bullet.BulletSimulator(**quick), budget=6)
     with ThreadPoolExecutor(3) as executor:
-        elsewhere = found(trials=trials, simulator=bullet.BulletSimulator(settle_limit=0.5), budget=6,
+        elsewhere = found(trials=trials, simulator=bullet.BulletSimulator(**quick), budget=6,
                           executor=executor)
     same(here, elsewhere)

@@ -153,13 +153,75 @@ def test_a_finer_simulation_widens_what_it_moves():
     missing = 2 * shift[0]  # what halving the step moves is half of an error of first order
     assert found.uncertainty.std[0] == pytest.approx(np.hypot(plain.uncertainty.std[0], missing), rel=0.02)
     assert found.uncertainty.std[1] == pytest.approx(plain.uncertainty.std[1], rel=0.02)
-    assert found.evaluations == plain.evaluations + 1
+    assert found.evaluations == plain.evaluations + 1 + 2  # both ends of what became uncertain
     assert len(finer.asked) == 1
 
 
 def test_a_finer_simulation_that_fails_leaves_nothing_known():
     found = examined(noisy_model(), finer=lambda points: [None])
     assert found.uncertainty.verdicts == ('not identifiable', 'not identifiable')
+
+
+def test_other_noise_of_the_initial_chains_is_simulated_and_widens_what_it_moves():
+    model = noisy_model()
+    moved = model.jacobian @ np.array([0.003, 0.0])
+    starts = [Model(model.jacobian, model.errors + sign * moved) for sign in (1, -1)]
+    broken = Model(model.jacobian, model.errors, fails=lambda point: True)
+    plain, found = examined(model), examined(model, starts=[*starts, broken])
+    assert [len(one.asked) for one in (*starts, broken)] == [1, 1, 1]
+    assert found.evaluations == plain.evaluations + 3
+    assert found.uncertainty.std[0] > 2 * plain.uncertainty.std[0]
+    assert found.uncertainty.std[1] < 1.5 * plain.uncertainty.std[1]
+
+
+class Fading(Model):
+    """The effect of the first parameter is exponential: like a strain, which fades as the stiffness grows."""
+
+    GROWTH = 12.0
+
+    def at(self, point):
+        effect = (np.exp(self.GROWTH * (point[0] - TRUTH[0])) - 1) / self.GROWTH
+        return self.errors + self.jacobian @ (effect, point[1] - TRUTH[1])
+
+
+def fading(seed, size):
+    model = noisy_model(seed)
+    return Fading(model.jacobian * (size, 1.0), model.errors - model.jacobian @ (optimum(model) - TRUTH) * -1)
+
+
+def strain(value):
+    return np.exp(Fading.GROWTH * (value - TRUTH[0]))
+
+
+def test_an_interval_reaches_to_where_the_effect_has_really_changed():
+    known, hardly = (examined(fading(1, size), TRUTH).uncertainty for size in (1.0, 0.007))
+    # Far better known than the effect fades: symmetric.
+    assert known.upper[0] - TRUTH[0] == pytest.approx(TRUTH[0] - known.lower[0], rel=0.1)
+    # About as large as the noise: it may be nothing as well.
+    assert TRUTH[0] - 1.645 * hardly.std[0] > 0.1
+    assert hardly.lower[0] == 0.0
+    # Where it grows there is an end.
+    assert hardly.upper[0] < TRUTH[0] + 1.7 * hardly.std[0]
+    assert hardly.upper[1] - hardly.lower[1] == pytest.approx(known.upper[1] - known.lower[1], rel=0.1)
+
+
+def test_intervals_of_a_linear_model_stay_as_they_are():
+    model = noisy_model()
+    model.jacobian[:, 0] *= 0.01
+    point = np.array([0.5, 0.6])
+    found = examined(model, point).uncertainty
+    half = 1.645 * found.std
+    assert 0.02 < half[0] < 0.4
+    assert found.lower == pytest.approx(point - half)
+    assert found.upper == pytest.approx(point + half)
+
+
+def test_an_end_that_cannot_be_simulated_stays_where_it_is():
+    model = fading(1, 0.007)
+    usual = examined(model, TRUTH).uncertainty
+    model.fails = lambda point: point[0] < TRUTH[0] - usual.std[0]
+    found = examined(model, TRUTH).uncertainty
+    assert found.lower[0] == pytest.approx(TRUTH[0] - 1.645 * found.std[0])
 
 
 def test_a_stop_in_the_middle_is_passed_on():

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from resting import trial_of
 
-from dlo_calibration.noise import noise, noise_of, smooth
+from dlo_calibration.chain import Chain
+from dlo_calibration.noise import noise, noise_of, places_along, smooth
 
 MILLIMETRE = 1e-3
 
@@ -89,9 +90,98 @@ def test_a_smooth_misfit_is_no_noise():
     assert noise_of(misfit) < 0.01 * MILLIMETRE
 
 
-def test_smoothing_comes_nearer_to_the_truth():
-    places = np.linspace(0, 1, 41)
-    truth = arc(places, 0.3)
-    rough = truth + np.random.default_rng(6).normal(0, MILLIMETRE, truth.shape)
-    assert np.std(smooth(rough, places, MILLIMETRE) - truth) < 0.6 * MILLIMETRE
-    assert smooth(truth, places, 0.0) == pytest.approx(truth, abs=1e-6)
+def wave(places):
+    """Return a bent curve in space, at places along it from 0 to about 0.6 m."""
+    return np.stack([places, 0.06 * np.sin(7 * places), 0.02 * np.cos(5 * places)], axis=1)
+
+
+def smoothed(truth, noise=MILLIMETRE, draws=40, believed=None):
+    """Return (draws, n, 3) smoothed noisy copies."""
+    random = np.random.default_rng(6)
+    return np.array([smooth(truth + random.normal(0, noise, truth.shape), believed or noise)
+                     for _ in range(draws)])
+
+
+def size(errors):
+    return np.sqrt(np.mean(np.square(errors), axis=tuple(range(errors.ndim - 1))))
+
+
+@pytest.mark.parametrize(('believed', 'limit'), [(0.75, 0.8), (1.0, 0.7), (1.25, 0.7)])
+@pytest.mark.parametrize('count', [21, 41])
+def test_smoothing_takes_noise_away_along_the_curve_as_across_it(count, believed, limit):
+    truth = wave(np.linspace(0, 0.6, count))
+    truth = Chain(truth).resample(np.linspace(0, Chain(truth).length, count))
+    assert (size(smoothed(truth, believed=believed * MILLIMETRE) - truth) < limit * MILLIMETRE).all()
+
+
+def test_smoothing_leaves_the_length_true_that_noise_makes_longer():
+    truth = Chain(wave(np.linspace(0, 0.6, 21)))
+    truth = Chain(truth.resample(np.linspace(0, truth.length, 21)))
+    random = np.random.default_rng(7)
+    longer, errors = [], []
+    for _ in range(200):
+        rough = truth.points + random.normal(0, MILLIMETRE, (21, 3))
+        longer.append(Chain(rough).length - truth.length)
+        errors.append(Chain(smooth(rough, MILLIMETRE)).length - truth.length)
+    assert np.mean(longer) > 1.0 * MILLIMETRE
+    assert abs(np.mean(errors)) < 0.4 * MILLIMETRE
+    assert np.std(errors) < 1.2 * np.sqrt(2) * MILLIMETRE  # that of its two ends
+
+
+def test_a_straight_line_keeps_the_noise_of_a_parabola():
+    # It is in three of 21 the parts, of each coordinate, that third differences do not see.
+    places = np.linspace(0, 0.6, 21)
+    truth = np.stack([places, 0.3 * places, 0 * places], axis=1)
+    errors = np.sqrt(np.mean(np.square(smoothed(truth, draws=200) - truth)))
+    least = np.sqrt(3 / 21) * MILLIMETRE
+    assert 0.95 * least < errors < 1.4 * least
+
+
+@pytest.mark.parametrize('count', [3, 4, 5, 13, 31])
+@pytest.mark.parametrize('noise', [0.0, 1e-6])
+def test_uneven_exact_points_stay_where_they_are(count, noise):
+    random = np.random.default_rng(8)
+    truth = wave(0.6 * places_of(count, False, random))
+    assert smooth(truth, noise) == pytest.approx(truth, abs=3e-6)
+
+
+def test_uneven_noisy_points_are_not_made_even_and_lose_the_noise_across_the_curve():
+    places = 0.6 * places_of(21, False, np.random.default_rng(9))
+    along, *across = size(smoothed(wave(places)) - wave(places))
+    assert along < 1.05 * MILLIMETRE
+    assert max(across) < 0.8 * MILLIMETRE
+
+
+@pytest.mark.parametrize('count', [3, 4])
+def test_few_points_can_be_smoothed(count):
+    zigzag = np.stack([np.arange(count), np.arange(count) % 2, np.zeros(count)], axis=1) * 0.1
+    assert smooth(zigzag, 1e-3) == pytest.approx(zigzag, abs=1e-4)
+    assert np.isfinite(smooth(zigzag, 1.0)).all()
+
+
+def test_smoothing_does_not_depend_on_the_frame_or_the_direction():
+    random = np.random.default_rng(10)
+    rough = wave(np.linspace(0, 0.6, 21)) + random.normal(0, MILLIMETRE, (21, 3))
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    found = smooth(rough, MILLIMETRE)
+    assert smooth(rough @ turn + 1, MILLIMETRE) == pytest.approx(found @ turn + 1)
+    assert smooth(rough[::-1], MILLIMETRE) == pytest.approx(found[::-1])
+    assert smooth(3 * rough, 3 * MILLIMETRE) == pytest.approx(3 * found)
+
+
+def test_places_are_even_where_noise_explains_that_they_are_not():
+    even = np.linspace(0, 0.6, 21)
+    truth = np.stack([even, 0 * even, 0 * even], axis=1)
+    random = np.random.default_rng(11)
+    raw, found = [], []
+    for _ in range(50):
+        rough = truth + random.normal(0, MILLIMETRE, truth.shape)
+        steps = np.linalg.norm(np.diff(rough, axis=0), axis=1)
+        raw.append(np.std(steps))
+        found.append(np.std(np.diff(places_along(rough, MILLIMETRE))))
+        assert places_along(rough, MILLIMETRE)[-1] == pytest.approx(steps.sum())
+    assert np.mean(raw) == pytest.approx(np.sqrt(2) * MILLIMETRE, rel=0.1)
+    assert np.mean(found) < 0.3 * np.mean(raw)
+    uneven = np.stack([even**2, 0 * even, 0 * even], axis=1)
+    assert places_along(uneven, 1e-6) == pytest.approx(even**2, rel=1e-4)
+    assert places_along(uneven, 0.0).tolist() == pytest.approx((even**2).tolist(), abs=1e-15)

@@ -226,6 +226,36 @@ def test_an_interval_contains_the_optimum_of_a_finer_simulation():
     assert found.std[1] < 0.02
 
 
+def test_other_noise_of_the_initial_chains_widens_an_interval_by_what_it_moves():
+    jacobian = linear_model(columns=1)
+    residuals = np.random.default_rng(9).normal(0, 1e-3, ROWS)
+    rows = slice(3 * 40, 3 * 80)  # of the second trial
+    moved = np.zeros(ROWS)
+    moved[rows] = jacobian[rows, 0] * 0.01
+    share = np.sum(jacobian[rows]**2) / np.sum(jacobian**2)  # of what is known is from there
+    plain = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3)
+    found = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3,
+                          starts=[residuals + moved, residuals - moved])
+    assert found.std[0] == pytest.approx(np.hypot(plain.std[0], 0.01 * share), rel=0.2)
+    assert found.std[0] > 2 * plain.std[0]
+    unmoved = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3, starts=[residuals])
+    assert unmoved.std == pytest.approx(plain.std)
+    one_of_four = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3,
+                                starts=[residuals + moved, *[residuals] * 3])
+    assert one_of_four.std[0] == pytest.approx(np.hypot(plain.std[0], 0.005 * share), rel=0.2)
+
+
+def test_a_start_that_ends_elsewhere_altogether_is_an_outlier():
+    jacobian = linear_model()
+    residuals = np.random.default_rng(10).normal(0, 1e-3, ROWS)
+    there, further = residuals.copy(), residuals.copy()
+    there[:30] += 0.1
+    further[:30] += 10.0
+    near, far = (from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3, starts=[one])
+                 for one in (there, further))
+    assert far.std == pytest.approx(near.std)
+
+
 def test_outliers_hardly_widen_the_intervals():
     residuals = np.random.default_rng(7).normal(0, 1e-3, ROWS)
     spoilt = residuals.copy()
