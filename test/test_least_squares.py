@@ -67,6 +67,20 @@ def test_it_converges_in_few_evaluations_to_one_point_from_any_seed(roughness):
     assert np.median(counts) < 45
 
 
+def kinked(point):
+    """Return residuals [m] of the valley with kinks in every parameter, as sticking and slipping makes them."""
+    saw = np.abs((np.asarray(point) / 0.08) % 1 * 2 - 1)
+    return valley(point + 0.03 * saw)
+
+
+def test_kinks_do_not_keep_a_seed_in_a_worse_minimum():
+    costs = []
+    for seed in range(12):
+        search, _ = solve(kinked, seed)
+        costs.append(float(np.square(kinked(search.best)).sum()))
+    assert max(costs) < 1.02 * min(costs)
+
+
 def test_outliers_do_not_pull():
     found = solve(lambda point: valley(point, outliers=0.3))[0].best
     assert found == pytest.approx(TRUTH, abs=0.005)
