@@ -68,7 +68,7 @@ def test_it_converges_in_few_evaluations_to_one_point_from_any_seed(roughness):
 
 
 def kinked(point):
-    """Return residuals [m] of the valley with kinks in every parameter, as sticking and slipping makes them."""
+    """Return residuals [m] of the valley with kinks in every parameter, as of what sticks and slips."""
     saw = np.abs((np.asarray(point) / 0.08) % 1 * 2 - 1)
     return valley(point + 0.03 * saw)
 
