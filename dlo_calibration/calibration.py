@@ -35,7 +35,8 @@ from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
-from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
+from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spread_of_best, Uncertainty
+from dlo_calibration.unexplained import Explanation, explanations
 
 PAPER_EVALUATIONS = 150
 STARTS = 16  # initial chains that are simulated with other noise, over all trials
@@ -76,6 +77,8 @@ class CalibrationResult:
     :param chains: (g, n, 3) [m] the simulated goals of each trial.
     :param examination: of the surroundings of what was found; None where there was no time for it.
     :param advice: which action to observe next; None where none would help, or it was not asked for.
+    :param explanations: what more of the object would explain of what the fit leaves over; empty where
+        that is noise, or it was not asked for.
     """
 
     space: ParameterSpace
@@ -93,6 +96,7 @@ class CalibrationResult:
     confirmation: Confirmation | None = None
     examination: Examination | None = None
     advice: Advice | None = None
+    explanations: tuple[Explanation, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -319,6 +323,27 @@ def advised(result: CalibrationResult, simulator: Simulator,
     advice = advise(result.trials, result.space, simulator, result.best.point,
                     result.examination.uncertainty, result.length, should_stop)
     return replace(result, advice=advice, seconds=result.seconds + clock() - begun)
+
+
+def explained(result: CalibrationResult, simulator: Simulator,
+              should_stop: Callable[[], bool] = lambda: False,
+              clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
+    """
+    Return a result with what more of the object would explain, where it leaves more than noise.
+
+    Each parameter that was held fixed is simulated once for that, which counts in `seconds` only.
+    """
+    found, best = result.examination, result.best
+    if found is None or not found.regular or best.residuals is None or (
+            found.uncertainty.residual < MODEL_ERROR * found.noise):
+        return result
+    begun = clock()
+    try:
+        words = explanations(result.trials, result.space, simulator, best.point, best.residuals,
+                             found.jacobian, should_stop)
+    except CancelledError:
+        return result
+    return replace(result, explanations=words, seconds=result.seconds + clock() - begun)
 
 
 def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty) -> dict[str, ParameterEstimate]:

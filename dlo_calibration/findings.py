@@ -25,13 +25,15 @@ from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.gain import silent
 from dlo_calibration.parameters import BY_NAME, PER_WEIGHT, SCALE
 from dlo_calibration.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
+from dlo_calibration.unexplained import PARTS
 
 MEAN_DISTANCE = float(np.sqrt(8 / np.pi))  # of white noise in three coordinates, in its standard deviations
 
 
 def sentences(result: CalibrationResult) -> list[str]:
     """Return what is known, how well, what is not, what would tell it, and how far to trust the fit."""
-    return [*_known(result), *_open(result), *_silent(result), *_advice(result), *_fit(result)]
+    return [*_known(result), *_open(result), *_silent(result), *_advice(result), *_fit(result),
+            *_unexplained(result)]
 
 
 def physical_text(value: float, unit: str) -> str:
@@ -78,7 +80,8 @@ def values(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': None if found is None else found.default_error,
         'noise_m': None if found is None else found.noise,
         'residual_std_m': None if found is None else found.uncertainty.residual,
-        'correlations': correlations, 'undetermined': list(result.undetermined), 'advice': advice}
+        'correlations': correlations, 'undetermined': list(result.undetermined), 'advice': advice,
+        'explanations': {one.name: one.share for one in result.explanations}}
 
 
 def _known(result: CalibrationResult) -> list[str]:
@@ -146,3 +149,15 @@ def _fit(result: CalibrationResult) -> list[str]:
             'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
             'the rest is what the model, or the recorded path of a hand, does not explain.'))
     return [' '.join(words)]
+
+
+def _unexplained(result: CalibrationResult) -> list[str]:
+    """Say what to calibrate, too."""
+    shares = [f'{one.name} {100 * one.share:.0f} %' for one in result.explanations]
+    if not shares:
+        return []
+    names = [one.name for one in result.explanations if one.name != PARTS]
+    how = [f'add {" or ".join(names)} to calibrate'] * bool(names)
+    how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
+    return [f'Of the squares of what is left over, these would explain about: {", ".join(shares)}. '
+            f'To calibrate them, too, {"; or ".join(how)}.']

@@ -29,7 +29,7 @@ import traceback
 from typing import Callable, Iterator, Sequence, Union
 
 from dlo_calibration import pool
-from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed
+from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed, explained
 from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
@@ -112,6 +112,7 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
             trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
             on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
         result = _noted(advised(result, simulator, should_stop), guessed)
+        result = explained(result, simulator, should_stop)
     told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     result = replace(result, warnings=(*result.warnings, *told))
     return confirmed_with(result, options, make_simulator, should_stop)

@@ -30,7 +30,8 @@ ORDER = (
     # pure NumPy and SciPy
     'errors', 'samples', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
     'noise', 'layout', 'suspension', 'estimate', 'excitation',
-    'search', 'confirmation', 'uncertainty', 'evaluation', 'examination', 'advice', 'calibration', 'parts',
+    'search', 'confirmation', 'uncertainty', 'evaluation', 'examination', 'advice', 'unexplained',
+    'calibration', 'parts',
     '__init__', 'config', 'parameter_file', 'gain', 'findings', 'slices',
     # messages and files
     'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',

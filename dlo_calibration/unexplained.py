@@ -1,0 +1,124 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Unexplained: what more of the object would explain, of what a fit leaves over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Callable, Iterator, Sequence
+
+import numpy as np
+
+from dlo_calibration.chain import Floats
+from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
+from dlo_calibration.search.huber import Huber
+from dlo_calibration.simulator import Simulator
+from dlo_calibration.trial import Trial
+
+PARTS = 'parts'  # the name of an explanation by parts of different stiffness
+TRIED_PARTS = 4
+STEP = 0.15  # that a parameter is moved, in the unit cube;
+LONG_STEP = 0.5  # from where it is nothing at all
+FURTHEST = 2.0  # times that step, to which its effect is trusted to grow
+WORTH_TELLING = 0.1  # of the squares that are left
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """
+    One thing that a calibration held fixed.
+
+    :param name: of the parameter, or PARTS.
+    :param share: of the sum of squares left over, that it would explain.
+    """
+
+    name: str
+    share: float
+
+
+def explanations(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
+                 residuals: Floats, jacobian: Floats,
+                 should_stop: Callable[[], bool] = lambda: False) -> tuple[Explanation, ...]:
+    """
+    Return what would explain at least a tenth of what is left, most first.
+
+    Each parameter that was held fixed is moved once; what counts is its effect
+    on the residuals that the free ones cannot have (a score test: Rao, Linear
+    Statistical Inference and Its Applications, 1973, 6e.3).
+
+    :param point: (d,) what was found, in the unit cube.
+    :param residuals: (m,) [m] there.
+    :param jacobian: (m, d) [m per unit cube].
+    :raises CancelledError: when stopped.
+    """
+    roots = Huber.of(residuals).roots(residuals)
+    basis, _ = np.linalg.qr(roots[:, None] * jacobian)
+    left = _without(basis, roots * residuals)
+    found = []
+    for name, wider, moves in _candidates(space):
+        evaluator = Evaluator(trials, wider, simulator)
+        columns = []
+        for move in moves:
+            seen = evaluator.evaluate(0, np.concatenate([point, move]), should_stop).residuals
+            if seen is not None:
+                columns.append(_without(basis, roots * (seen - residuals)))
+        share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
+        if share >= WORTH_TELLING:
+            found.append(Explanation(name, share))
+    return tuple(sorted(found, key=lambda one: -one.share))
+
+
+def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Floats]]:
+    """Yield names, the spaces with what is added, and the (k, a) places of that in the unit cube."""
+    for parameter in PARAMETERS:
+        name = parameter.name
+        if name in space.free or name in PART_NAMES or name == 'mass' and not space.mass_known:
+            continue
+        fixed = {key: value for key, value in space.fixed.items() if key != name}
+        now = space.fixed.get(name, parameter.default) / SCALE
+        step = LONG_STEP if _is_nothing(parameter, now) else STEP
+        yield (name, replace(space, free=(*space.free, name), fixed=fixed),
+               np.array([[now + step if now + step <= 1 else now - step]]))
+    if space.parts == 1 and 'flexibility' in space.free:
+        divided = space.divided(TRIED_PARTS)
+        even = np.array([BY_NAME[name].default for name in PART_NAMES[:TRIED_PARTS - 1]]) / SCALE
+        yield PARTS, divided, even + STEP * np.eye(len(even))
+
+
+def _is_nothing(parameter: Parameter, now: float) -> bool:
+    """Tell whether a parameter means at the lower end of a logarithmic scale that there is nothing of it."""
+    return parameter.neutral == 0 and not parameter.linear and now == 0
+
+
+def _without(basis: Floats, vector: Floats) -> Floats:
+    """Return (m,) what of a vector is perpendicular to (m, d) columns."""
+    rest: Floats = vector - basis @ (basis.T @ vector)
+    return rest
+
+
+def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:
+    """Return the share of (m,) what is left that a combination of (m,) columns, not too long, takes away."""
+    from scipy.optimize import lsq_linear
+
+    matrix = np.stack(columns, axis=1) if columns else np.zeros((len(left), 0))
+    total = float(left @ left)
+    if not total > 0 or not float(np.square(matrix).sum()) > 0:
+        return 0.0
+    # What is nothing at its default cannot be less.
+    least = 0.0 if parameter is not None and parameter.neutral == 0 else -FURTHEST
+    steps = lsq_linear(matrix, -left, (least, FURTHEST), method='bvls').x
+    rest = left + matrix @ steps
+    return 1 - float(rest @ rest) / total

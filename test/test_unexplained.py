@@ -1,0 +1,72 @@
+# Copyright 2026 The dlo_calibration authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Unexplained: what was held fixed, and would have explained the rest."""
+
+from dataclasses import replace
+
+import pytest
+from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
+
+from dlo_calibration.calibration import calibrate, explained
+from dlo_calibration.compiled import CompiledSimulator
+from dlo_calibration.findings import sentences, values
+from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.search import LeastSquares
+from dlo_calibration.unexplained import PARTS
+
+
+def found(trials, space=EVEN):
+    simulator = CompiledSimulator(table=False)
+    result = calibrate(trials, space, simulator, LeastSquares(space.dimension, 1), budget=80)
+    return explained(result, simulator)
+
+
+@pytest.mark.parametrize('name, value', [('natural_curvature', 15.0), ('length_scale', 70.0)])
+def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
+    result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
+    assert result.explanations[0].name == name
+    assert result.explanations[0].share > 0.15
+    assert f'add {name}' in sentences(result)[-1]
+    assert values(result)['explanations'][name] == result.explanations[0].share
+
+
+def test_it_names_parts_of_different_stiffness():
+    result = found(observed(EVEN.divided(4), STIFF_MIDDLE))
+    assert result.explanations[0].name == PARTS
+    assert result.explanations[0].share > 0.15
+    assert 'set parts to 0' in sentences(result)[-1]
+
+
+def test_where_only_noise_is_left_there_is_nothing_to_explain():
+    result = found(observed(EVEN, TRUTH))
+    assert result.explanations == ()
+    assert values(result)['explanations'] == {}
+
+
+def test_nothing_is_named_that_would_not_help():
+    # Points that are all off by a centimetre, whatever the DLO is made of.
+    trials = [replace(trial, goals=tuple(
+        replace(goal, chain=replace(goal.chain, points=goal.chain.points + 0.01 * (-1)**k))
+        for k, goal in enumerate(trial.goals))) for trial in observed(EVEN, TRUTH)]
+    result = found(trials)
+    assert result.examination.uncertainty.residual > 5e-3
+    assert result.explanations == ()
+
+
+def test_a_stop_leaves_the_result_as_it_is():
+    trials = observed(ParameterSpace((*EVEN.free, 'length_scale')), {**TRUTH, 'length_scale': 40.0})
+    simulator = CompiledSimulator(table=False)
+    result = calibrate(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=80)
+    assert explained(result, simulator, should_stop=lambda: True) is result
