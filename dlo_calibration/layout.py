@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.action import Hand
 from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
@@ -61,6 +62,7 @@ class Layout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 
+        There is none within a clamp that holds from the start: that piece does not bend.
         The initial chain is smoothed as the noise of the trial's chains asks
         for: noise makes a chain longer, and bends a stiff one as nothing real does.
 
@@ -73,7 +75,11 @@ class Layout:
         if len(fixed) > count:
             raise InputError(f'trial {trial.name!r}', f'{len(grips)} gripped points',
                              f'fewer than the {count} nodes', 'raise the number of nodes')
-        places = spread_places(fixed, count)
+        pairs = {pair for hand in trial.hands if hand.times[0] <= 0
+                 for pair in zip(sorted(hand.grips)[:-1], sorted(hand.grips)[1:], strict=True)
+                 if pair[1] == pair[0] + 1}
+        rigid = np.isin(fixed[:-1], point_places[[first for first, _ in pairs]])
+        places = spread_places(fixed, count, rigid)
         observe = interpolation_matrix(places, point_places)
         velocities = np.zeros((count, 3)) if trial.velocity is None else \
             interpolation_matrix(point_places, places) @ trial.velocity
@@ -107,10 +113,16 @@ def _without_noise(trial: Trial) -> Chain:
     return replace(trial.initial, points=smooth(trial.initial.points, sigma))
 
 
-def spread_places(fixed: Floats, count: int) -> Floats:
-    """Return `count` increasing places that contain the `fixed` ones, the others evenly between."""
+def spread_places(fixed: Floats, count: int, rigid: NDArray[np.bool_] | None = None) -> Floats:
+    """
+    Return `count` increasing places that contain the `fixed` ones, the others evenly between.
+
+    :param rigid: (f - 1,) pieces between the f fixed places that stay whole, unless all are; None: none.
+    """
     pieces = np.ones(len(fixed) - 1, int)
     widths = np.diff(fixed)
+    if rigid is not None and not rigid.all():
+        widths[rigid] = 0.0
     while pieces.sum() < count - 1:
         pieces[np.argmax(widths / pieces)] += 1
     parts = [np.linspace(a, b, k, endpoint=False)

@@ -62,6 +62,31 @@ def test_every_gripped_point_has_a_node_of_its_own(grips, count):
     assert layout.points[list(nodes)] == pytest.approx(arc()[grips], abs=1e-9)
 
 
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 18), st.integers(12, 80))
+def test_a_clamp_that_holds_from_the_start_has_no_node_within(first, count):
+    one = trial(arc(), ((first, first + 1),))
+    a, b = Layout.of(one, count).nodes(one.hands[0])
+    assert b == a + 1
+    free = np.delete(np.diff(Layout.of(one, count).places), a)
+    assert free.max() < 2.1 * free.min() + 1e-9 or count < 20
+
+
+def test_points_between_those_that_a_hand_grips_keep_their_nodes():
+    one = trial(arc(), ((2, 6),))
+    a, b = Layout.of(one, 61).nodes(one.hands[0])
+    assert b > a + 4
+
+
+def test_a_piece_that_is_clamped_later_bends_until_then():
+    later = Hand('late', (10, 11), [0.5, 1.0], np.zeros((2, 3)))
+    one = Trial('t', Chain(arc()), (Action((later,)),), (Goal(Chain(arc()), 2.0),))
+    assert Layout.of(one, 81).places == pytest.approx(spread_places(Layout.of(one, 81).point_places[
+        [0, 10, 11, 20]], 81))
+    a, b = Layout.of(one, 81).nodes(later)
+    assert b > a + 1
+
+
 @pytest.mark.parametrize('count', [15, 31, 61])
 def test_nodes_lie_on_the_curve_and_give_the_observed_points_back(count):
     layout = Layout.of(trial(arc()), count)
