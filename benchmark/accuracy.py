@@ -39,9 +39,9 @@ HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,1,2,3,4,5,6,7'
 MOCAP_OTHER = '42,43,44,45,46,47,48,49,50,51,52,53,54,55'
-MOCAP_PARAMETERS = 'flexibility,elasticity,damping,internal_damping'
-MOCAP_PARTS = '1'
+MOCAP_PARAMETERS = 'flexibility,damping,internal_damping,torsion'
 HANGING_PARAMETERS = 'flexibility,length_scale'
+MANY_EVALUATIONS = '400'  # of cables and wires, in as many parts as their trials support
 HANGING_NODES = '61'
 WIRE = 1.5  # m
 
@@ -107,8 +107,8 @@ def mocap(folder: Path, options: list[str]) -> str:
     parts = []
     for cable in ('dlo1', 'dlo2', 'dlo3'):
         session = convert('mocap', cable, folder / cable, '--recordings', MOCAP_FIT)
-        fitted = fit(session, folder / f'{cable}_fit', '--calibrate', MOCAP_PARAMETERS,
-                     '--parts', MOCAP_PARTS, *options)
+        fitted = fit(session, folder / f'{cable}_fit', '--calibrate', MOCAP_PARAMETERS, '--parts', '0',
+                     *options, '--evaluations', MANY_EVALUATIONS)
         other = validate(folder / f'{cable}_fit',
                          convert('mocap', cable, folder / f'{cable}_other', '--recordings', MOCAP_OTHER))
         parts.append(f'## {cable}\n\n{table("recordings", fitted, other)}')
@@ -117,26 +117,32 @@ def mocap(folder: Path, options: list[str]) -> str:
 
 def hanging(folder: Path, options: list[str]) -> str:
     """Tabulate two wires: fitted on four repeats, judged on the fifth; and EI of each repeat by itself."""
-    parts = []
-    arguments = ['--calibrate', HANGING_PARAMETERS, '--nodes', HANGING_NODES, *options]
+    sections = []
+    arguments = ['--calibrate', HANGING_PARAMETERS, '--nodes', HANGING_NODES, *options,
+                 '--evaluations', MANY_EVALUATIONS]
     for wire in ('white', 'black'):
-        fitted = fit(convert('hanging', wire, folder / wire, '--repeats', '0,1,2,3'), folder / f'{wire}_fit',
-                     *arguments)
-        other = validate(folder / f'{wire}_fit',
-                         convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4'))
+        session = convert('hanging', wire, folder / wire, '--repeats', '0,1,2,3')
+        last = convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4')
+        tables, percents = [], []
+        for parts in ('1', '0'):
+            fitted = fit(session, folder / f'{wire}_fit_{parts}', *arguments, '--parts', parts)
+            other = validate(folder / f'{wire}_fit_{parts}', last)
+            tables.append(table('repeats', fitted, other))
+            percents.append([100 * one['rms_error_m'] / WIRE for one in (fitted, other)])
         stiffness = []
         for repeat in '01234':
             session = convert('hanging', wire, folder / f'{wire}_{repeat}', '--repeats', repeat)
             one = fit(session, folder / f'{wire}_{repeat}_fit', *arguments)
             stiffness.append(one['parameters']['flexibility']['physical_value'])
-        percent = [100 * one['rms_error_m'] / WIRE for one in (fitted, other)]
         spread = 100 * float(np.std(stiffness) / np.mean(stiffness))
-        parts.append(
-            f'## {wire}\n\n{table("repeats", fitted, other)}\n\nRoot mean square: {percent[0]:.2f} % of the '
-            f'length fitted, {percent[1]:.2f} % predicted. EI of each repeat by itself: '
-            + ', '.join(f'{value:.3g}' for value in stiffness)
+        sections.append(
+            f'## {wire}\n\nAn even wire:\n\n{tables[0]}\n\n'
+            f'In as many parts as the repeats support:\n\n{tables[1]}\n\n'
+            f'Root mean square in percent of the length, fitted and predicted: {percents[0][0]:.2f} and '
+            f'{percents[0][1]:.2f} as an even wire, {percents[1][0]:.2f} and {percents[1][1]:.2f} in parts. '
+            'EI of each repeat by itself: ' + ', '.join(f'{value:.3g}' for value in stiffness)
             + f' N m^2, standard deviation {spread:.0f} %.')
-    return '\n\n'.join(parts)
+    return '\n\n'.join(sections)
 
 
 def table(what: str, fitted: dict[str, Any], other: dict[str, Any]) -> str:

@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_request(folder / 'hand_paths.xml', hand_paths())
     trials, _ = session_trials(read_session(HERE / 'object1'), Options())
     rounded_trials = [replace(trial, initial=rounded(trial.initial.points)) for trial in trials]
-    options = Options.of({**FIT, 'workers': 2, 'engine': 'bullet'})
+    options = Options.of({**FIT, 'workers': 2})
     result = calibrate_with(rounded_trials, options, make_simulator, lambda _: None, lambda: False)
     write_result(folder / 'dlo.xml', result, options.flat())
     return 0
