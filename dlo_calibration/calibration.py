@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
 from dataclasses import dataclass, replace
+from functools import partial
 import time
 from typing import Callable, Mapping, Sequence
 
@@ -39,6 +40,7 @@ from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spr
 from dlo_calibration.unexplained import Explanation, explanations
 
 PAPER_EVALUATIONS = 150
+STOPPED = 'stopped on request'
 STARTS = 16  # initial chains that are simulated with other noise, over all trials
 
 
@@ -140,7 +142,7 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
               should_stop: Callable[[], bool] = lambda: False,
               executor: Executor | None = None,
               clock: Callable[[], float] = time.monotonic,
-              seed: int | None = None) -> CalibrationResult:
+              seed: int | None = None, thorough: bool = True) -> CalibrationResult:
     """
     Find the parameter set that fits the trials best, and how sure it is.
 
@@ -155,6 +157,7 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
     :param executor: where evaluations run; None: here, one after the other.
     :param clock: seconds, for `CalibrationResult.seconds` only.
     :param seed: of the search, for the record.
+    :param thorough: False: the result is to be compared with others only, see `examined`.
     :raises InputError: where there is nothing to calibrate on.
     :raises SimulationError: where no evaluation could be simulated.
     """
@@ -163,9 +166,7 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
                          'record an initial chain, an action and a goal chain first')
     started = clock()
 
-    def everywhere(evaluator: Evaluator) -> Everywhere:
-        return Everywhere(evaluator, should_stop, executor)
-
+    everywhere = partial(Everywhere, should_stop=should_stop, executor=executor)
     evaluate = everywhere(Evaluator(trials, space, simulator))
     kept, best, stopped = _searched(evaluate, search, budget, on_evaluation)
     if best is None or not best.scores:
@@ -174,20 +175,52 @@ def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulat
     examination = None
     if not stopped:
         try:
-            examination, best = _examined(evaluate, everywhere, best)
+            examination, best = _examined(evaluate, everywhere, best, thorough)
         except CancelledError:
             stopped = True
-    reason = 'stopped on request' if stopped else \
+    reason = STOPPED if stopped else \
         search.stop_reason or f'budget of {budget} evaluations spent'
-    found = spread_of_best(kept, best.point)
+    return CalibrationResult(
+        space=space, parameters=_estimates_of(space, best, kept, examination), best=best,
+        trials=tuple(trials), chains=simulated_chains(trials, best), evaluations=tuple(kept),
+        seconds=clock() - started,
+        search=search.name, engine=simulator.name, stop_reason=reason, seed=seed,
+        warnings=_warnings(best, kept), examination=examination)
+
+
+def examined(result: CalibrationResult, simulator: Simulator, *,
+             should_stop: Callable[[], bool] = lambda: False,
+             executor: Executor | None = None,
+             clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
+    """
+    Return a result that was not examined thoroughly with all that is around it.
+
+    If stopped, with nothing of that but the spread of its evaluations.
+    """
+    begun, before = clock(), result.examination
+    everywhere = partial(Everywhere, should_stop=should_stop, executor=executor)
+    try:
+        examination, best = _examined(everywhere(Evaluator(result.trials, result.space, simulator)),
+                                      everywhere, result.best, thorough=True)
+    except CancelledError:
+        return replace(result, examination=None, stop_reason=STOPPED, parameters=_estimates_of(
+            result.space, result.best, result.evaluations, None))
+    count = examination.evaluations + (before.evaluations if before else 0)
+    examination = replace(examination, evaluations=count)
+    return replace(
+        result, best=best, chains=simulated_chains(result.trials, best), examination=examination,
+        parameters=_estimates_of(result.space, best, result.evaluations, examination),
+        seconds=result.seconds + clock() - begun)
+
+
+def _estimates_of(space: ParameterSpace, best: Evaluation, evaluations: Sequence[Evaluation],
+                  examination: Examination | None) -> dict[str, ParameterEstimate]:
+    """Return the parameters with what the examination says, else with the spread of the good evaluations."""
+    found = spread_of_best(evaluations, best.point)
     if examination is not None:
         found = examination.uncertainty if examination.regular else replace(
             found, excited=examination.uncertainty.excited)
-    return CalibrationResult(
-        space=space, parameters=estimates(space, best, found), best=best, trials=tuple(trials),
-        chains=simulated_chains(trials, best), evaluations=tuple(kept), seconds=clock() - started,
-        search=search.name, engine=simulator.name, stop_reason=reason, seed=seed,
-        warnings=_warnings(best, kept), examination=examination)
+    return estimates(space, best, found)
 
 
 def _searched(evaluate: Everywhere, search: Search, budget: int,
@@ -220,7 +253,7 @@ def _searched(evaluate: Everywhere, search: Search, budget: int,
 
 
 def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere],
-              best: Evaluation) -> tuple[Examination, Evaluation]:
+              best: Evaluation, thorough: bool) -> tuple[Examination, Evaluation]:
     """
     Return what is around the best evaluation, and that evaluation as it is reported.
 
@@ -232,15 +265,15 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
     trials, space, simulator = evaluator.trials, evaluator.space, evaluator.simulator
     assert best.residuals is not None
     default, sigma = space.default_point(), noise(trials)
-    finer = simulator.refined()
+    finer = simulator.refined() if thorough else None
+    noisy = thorough and sigma > NO_NOISE and 'length_scale' not in space.free
     try:
         examination = examine(
             best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
             evaluate.residuals, default=default, noise=sigma,
             finer=None if finer is None else everywhere(Evaluator(trials, space, finer)).residuals,
-            starts=[] if not sigma > NO_NOISE or 'length_scale' in space.free else [
-                everywhere(Evaluator(others, space, simulator)).residuals
-                for others in _other_starts(trials, sigma)])
+            starts=[everywhere(Evaluator(others, space, simulator)).residuals
+                    for others in _other_starts(trials, sigma)] if noisy else [], thorough=thorough)
     finally:
         if finer is not None:
             finer.close()

@@ -23,6 +23,7 @@ from __future__ import annotations
 from concurrent.futures import CancelledError, Executor, Future
 import copy
 from dataclasses import dataclass, replace
+import pickle
 import threading
 from typing import Callable, Iterator, Mapping, Sequence
 import uuid
@@ -180,6 +181,7 @@ class Everywhere:
         self.evaluator = evaluator
         self._should_stop = should_stop
         self._executor = executor
+        self._parcel = _Parcel(evaluator)
         self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
 
     def __call__(self, points: Floats, first: int, limits: Limits | None = None) -> Iterator[Evaluation]:
@@ -192,7 +194,7 @@ class Everywhere:
                     return
             return
         futures: list[Future[Evaluation]] = [
-            self._executor.submit(_evaluate_elsewhere, self._key, self.evaluator, first + k, point, limits)
+            self._executor.submit(_evaluate_elsewhere, self._key, self._parcel, first + k, point, limits)
             for k, point in enumerate(points)]
         try:
             for future in futures:
@@ -226,6 +228,29 @@ def _wait(future: Future[Evaluation]) -> None:
         pass
 
 
+class _Parcel:
+    """
+    An evaluator on its way to workers.
+
+    It is pickled once, and unpickled where it is opened: trials with thousands of
+    chains take as long for that as to be simulated.
+    """
+
+    def __init__(self, evaluator: Evaluator | None, packed: bytes = b'') -> None:
+        self._evaluator, self._packed = evaluator, packed
+
+    def open(self) -> Evaluator:
+        """Return the evaluator; here it is the same one, elsewhere a new one."""
+        if self._evaluator is None:
+            self._evaluator = pickle.loads(self._packed)  # noqa: S301  # from the process that began this one
+        assert self._evaluator is not None
+        return self._evaluator
+
+    def __reduce__(self) -> tuple[type[_Parcel], tuple[None, bytes]]:
+        self._packed = self._packed or pickle.dumps(self._evaluator, pickle.HIGHEST_PROTOCOL)
+        return _Parcel, (None, self._packed)
+
+
 class _Here(threading.local):
     """
     What a worker's thread keeps: the evaluator of the calibration under way.
@@ -237,10 +262,10 @@ class _Here(threading.local):
     evaluator: Evaluator
     forget: Callable[[], object] = staticmethod(lambda: None)
 
-    def of(self, key: str, evaluator: Evaluator) -> Evaluator:
+    def of(self, key: str, parcel: _Parcel) -> Evaluator:
         if key != self.key:
             self.forget()
-            self.key, self.evaluator = key, copy.copy(evaluator)
+            self.key, self.evaluator = key, copy.copy(parcel.open())
             self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
         return self.evaluator
 
@@ -248,7 +273,7 @@ class _Here(threading.local):
 _here = _Here()
 
 
-def _evaluate_elsewhere(key: str, evaluator: Evaluator, index: int, point: Floats,
+def _evaluate_elsewhere(key: str, parcel: _Parcel, index: int, point: Floats,
                         limits: Limits | None) -> Evaluation:
     """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
-    return _here.of(key, evaluator).evaluate(index, point, limits=limits)
+    return _here.of(key, parcel).evaluate(index, point, limits=limits)

@@ -85,7 +85,7 @@ class Examination:
 
 def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]], evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Evaluate | None = None,
-            starts: Sequence[Evaluate] = ()) -> Examination:
+            starts: Sequence[Evaluate] = (), thorough: bool = True) -> Examination:
     """
     Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
 
@@ -94,6 +94,7 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     :param noise: see `Examination`.
     :param finer: simulates with more nodes and a smaller step; None: not examined.
     :param starts: simulate with other draws of the noise of the initial chains; may be none.
+    :param thorough: False: only as far as the trials that are left out ask for; intervals may be wrong.
     """
     count = 0
 
@@ -108,7 +109,7 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     *seen, at_default = residuals_at(beside)
     jacobian = np.stack([_column(residuals, point[k], beside[2 * k:2 * k + 2, k], seen[2 * k:2 * k + 2])
                          for k in range(dimension)], axis=1)
-    for _ in range(WIDENINGS):
+    for _ in range(WIDENINGS if thorough else 0):
         std = from_jacobian(point, residuals, jacobian, shapes, noise=noise).std
         wider = np.where(std > SUSPECT, np.clip(std, WIDE, WIDEST), steps)
         weak = np.flatnonzero(wider > 1.5 * steps)
@@ -133,7 +134,8 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
     count += len(drawn)
     found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift,
                           starts=[one for one in drawn if one is not None])
-    found = _reaching(point, residuals, jacobian, found, residuals_at)
+    if thorough:
+        found = _reaching(point, residuals, jacobian, found, residuals_at)
     assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,

@@ -19,11 +19,12 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from dataclasses import replace
 import math
+import time
 from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import calibrate, CalibrationResult
+from dlo_calibration.calibration import calibrate, CalibrationResult, examined
 from dlo_calibration.chain import frozen_array
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation import Evaluation
@@ -32,9 +33,9 @@ from dlo_calibration.search import Hints, LeastSquares, Search
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
 
-FIRST_SHARE = 0.5  # of the budget, that may go into the DLO that is even
+FIRST_SHARE = 0.4  # of the budget, that may go into the DLO that is even
 FEWEST_LEFT = 3  # evaluations for each parameter, without which no more parts are tried
-MOST_FAILURES = 2  # in a row: a DLO that is stiff in the middle alone needs four parts to show it
+EVEN_HALVES = 2  # parts that need not be better: what is stiff in the middle alone needs four to show it
 EXACT = 1e-6  # m; errors below it are none
 WORTHWHILE = 0.02  # share by which more parts lower the error of trials that are left out
 
@@ -56,7 +57,9 @@ def calibrate_parts(trials: Sequence[Trial], space: ParameterSpace, simulator: S
 
     The parameters are those of `calibration.calibrate`.
     """
+    started = time.monotonic()
     taken: list[tuple[ParameterSpace, Evaluation]] = []
+    divisible = len(trials) > 1 and 'flexibility' in space.free
 
     def fitted(space: ParameterSpace, search: Search, budget: int) -> CalibrationResult:
         def take(evaluation: Evaluation) -> None:
@@ -65,44 +68,44 @@ def calibrate_parts(trials: Sequence[Trial], space: ParameterSpace, simulator: S
             if on_evaluation is not None:
                 on_evaluation(evaluation)
 
-        return calibrate(trials, space, simulator, search, budget=budget, on_evaluation=take,
-                         should_stop=should_stop, executor=executor, seed=seed)
+        first = len(taken)
+        found = calibrate(trials, space, simulator, search, budget=budget, on_evaluation=take, seed=seed,
+                          should_stop=should_stop, executor=executor, thorough=not divisible)
+        return replace(found, best=replace(found.best, index=first + found.best.index))
 
-    if not _divisible(trials, space):
+    if not divisible:
         return fitted(space, search, budget)
     best = latest = fitted(space, search, max(1, math.ceil(FIRST_SHARE * budget)))
-    seconds, examined, failures, why = best.seconds, _examined(best), 0, ''
-    while _examined(latest) and 2 * latest.space.parts <= MOST_PARTS and failures < MOST_FAILURES:
+    count, why = _examined(best), ''
+    while _examined(latest) and 2 * latest.space.parts <= MOST_PARTS:
         finer, start = latest.space.halved(latest.best.point)
-        first = len(taken)
-        if budget - first < FEWEST_LEFT * finer.dimension:
+        left = budget - len(taken)
+        if left < FEWEST_LEFT * finer.dimension:
             why = f'the budget of {budget} evaluations is too small to try {finer.parts}'
             break
         try:
-            latest = fitted(finer, LeastSquares(finer.dimension, 0, Hints.at(start)), budget - first)
+            latest = fitted(finer, LeastSquares(finer.dimension, 0, Hints.at(start)), left)
         except SimulationError:  # those before stand
             why = f'{finer.parts} could not be simulated'
             break
-        latest = replace(latest, best=replace(latest.best, index=first + latest.best.index))
-        seconds += latest.seconds
-        examined += _examined(latest)
+        count += _examined(latest)
         if not _examined(latest):
             why = f'stopped before {finer.parts} were fitted'
         elif _better(latest, best):
-            best, failures, why = latest, 0, ''
+            best, why = latest, ''
         else:
-            failures += 1
             why = f'{finer.parts} would not predict left-out trials better'
-    count = best.space.parts
-    reason = f'{best.stop_reason}; {count} part{"s" * (count > 1)}' + f': {why}' * bool(why)
-    examination = best.examination and replace(best.examination, evaluations=examined)
+            if finer.parts > EVEN_HALVES * space.parts:
+                break
+    before = _examined(best)
+    if before:
+        best = examined(best, simulator, should_stop=should_stop, executor=executor)
+        count += max(0, _examined(best) - before)
+    parts = best.space.parts
+    reason = f'{best.stop_reason}; {parts} part{"s" * (parts > 1)}' + f': {why}' * bool(why)
     evaluations = tuple(_restated(evaluation, tried, best.space) for tried, evaluation in taken)
-    return replace(best, evaluations=evaluations, seconds=seconds, stop_reason=reason,
-                   examination=examination)
-
-
-def _divisible(trials: Sequence[Trial], space: ParameterSpace) -> bool:
-    return len(trials) > 1 and 'flexibility' in space.free
+    return replace(best, evaluations=evaluations, seconds=time.monotonic() - started, stop_reason=reason,
+                   examination=best.examination and replace(best.examination, evaluations=count))
 
 
 def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpace) -> Evaluation:
