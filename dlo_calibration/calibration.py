@@ -23,6 +23,7 @@ import time
 from typing import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.advice import Advice, advise
 from dlo_calibration.chain import Chain, Floats, frozen_array
@@ -34,6 +35,7 @@ from dlo_calibration.noise import NO_NOISE, noise, smooth
 from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
+from dlo_calibration.search.huber import Huber
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spread_of_best, Uncertainty
@@ -41,6 +43,8 @@ from dlo_calibration.unexplained import Explanation, explanations
 
 PAPER_EVALUATIONS = 150
 STOPPED = 'stopped on request'
+UNLIKELY = 2.71  # chi-square, one degree of freedom, that 10 % exceed
+FURTHEST = 0.1  # that excited parameters follow those that are set to their default, in the unit cube
 STARTS = 16  # initial chains that are simulated with other noise, over all trials
 
 
@@ -257,7 +261,8 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
     """
     Return what is around the best evaluation, and that evaluation as it is reported.
 
-    A parameter that no trial tells anything about gets its default, not what it had by chance.
+    A parameter that no trial tells anything about gets its default, not what it had by chance,
+    unless the trials refute the default.
 
     :raises CancelledError: when stopped.
     """
@@ -281,10 +286,31 @@ def _examined(evaluate: Everywhere, everywhere: Callable[[Evaluator], Everywhere
     point = np.where(excited, best.point, default)
     if np.array_equal(point, best.point):
         return examination, best
-    again = next(iter(evaluate(point[None, :], best.index)), None)
-    if again is None:
+    points = np.stack([point, _moved_along(point, best, examination.jacobian, excited)])
+    seen = list(evaluate(points, best.index))
+    if len(seen) < len(points):
         raise CancelledError
-    return replace(examination, evaluations=examination.evaluations + 1), best if again.failure else again
+    loss = Huber.of(best.residuals)
+    again = replace(min(seen, key=lambda one: loss.cost(one.residuals)), index=best.index)
+    examination = replace(examination, evaluations=examination.evaluations + len(points))
+    found = examination.uncertainty
+    # The cost is half the sum of squares.
+    worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / found.scale**2
+    if worse > UNLIKELY * int((point != best.point).sum()):  # what was found stays, unknown as it is
+        found = replace(found, excited=excited | (point != best.point))
+        return replace(examination, uncertainty=found), best
+    return examination, again
+
+
+def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDArray[np.bool_]) -> Floats:
+    """Return the (d,) point where the excited parameters have followed the others, by a Gauss-Newton step."""
+    assert best.residuals is not None
+    roots = Huber.of(best.residuals).roots(best.residuals)
+    after = roots * (best.residuals + jacobian @ (point - best.point))
+    step = np.linalg.lstsq(roots[:, None] * jacobian[:, excited], -after, rcond=None)[0]
+    moved = np.array(point)
+    moved[excited] = np.clip(point[excited] + np.clip(step, -FURTHEST, FURTHEST), 0.0, 1.0)
+    return moved
 
 
 def _other_starts(trials: Sequence[Trial], sigma: float) -> list[list[Trial]]:

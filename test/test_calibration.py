@@ -34,6 +34,7 @@ from dlo_calibration import (
     SimulationError,
     Trial,
 )
+from dlo_calibration.parameters import BY_NAME
 from dlo_calibration.search import RandomSearch, SEARCHES
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
@@ -93,6 +94,32 @@ def test_a_parameter_that_no_trial_tells_about_keeps_its_default_and_says_so():
     assert (damping.value, damping.lower, damping.upper) == (50.0, 0.0, 100.0)
     assert damping.verdict == 'not identifiable'
     assert damping.note == 'no trial tells anything about it; it keeps its default'
+    assert result.best.values == result.values
+
+
+class Numb(ToySimulator):
+    """Elasticity shows only where it is more than 35 of 100 from the truth."""
+
+    def simulate(self, trial, physical):
+        elasticity = BY_NAME['elasticity']
+        if abs(elasticity.value(physical['elasticity']) - TRUTH['elasticity']) < 35:
+            physical = {**physical, 'elasticity': elasticity.physical(TRUTH['elasticity'])}
+        return super().simulate(trial, physical)
+
+
+@pytest.mark.parametrize('default, kept', [(25.0, False), (80.0, True)])
+def test_a_default_that_the_trials_refute_is_not_kept(default, kept):
+    space = ParameterSpace(('flexibility', 'elasticity'), {**TRUTH, 'elasticity': default})
+    rough = np.random.default_rng(2)
+    trials = [replace(trial, goals=(replace(trial.goals[0], chain=replace(
+        trial.goals[0].chain, points=trial.goals[0].chain.points + rough.normal(0, 1e-3, (11, 3)))),))
+        for trial in TRIALS]
+    result = calibrate(trials, space, Numb(), search(space, name='least_squares'), budget=120)
+    elasticity = result.parameters['elasticity']
+    assert elasticity.verdict == 'not identifiable'
+    assert (elasticity.value == default) is kept
+    assert ('keeps its default' in elasticity.note) is kept
+    assert abs(elasticity.value - TRUTH['elasticity']) < 35
     assert result.best.values == result.values
 
 
