@@ -76,13 +76,13 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     from dlo_calibration.config import Options
     from dlo_calibration.description import read_result, write_result
     from dlo_calibration.parameters import ParameterSpace
-    from dlo_calibration.search import RandomSearch
+    from dlo_calibration.search import LeastSquares
     from dlo_calibration.session import read_session, session_trials
 
     session = read_session(ROOT / 'msg_samples/object1')
     trials, _ = session_trials(session, Options.of(session.options))
     simulator = BulletSimulator()
-    fitted = calibrate(trials[:1], ParameterSpace(mass=0.03), simulator, RandomSearch(4, seed=1), budget=1)
+    fitted = calibrate(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
     simulator.close()
     write_result(tmp_path / 'result.xml', fitted)
     snippet = (ROOT / 'README.md').read_text(encoding='utf-8').split('```python\n')[1].split('```')[0]
