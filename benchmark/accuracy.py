@@ -42,7 +42,7 @@ MOCAP_OTHER = '42,43,44,45,46,47,48,49,50,51,52,53,54,55'
 MOCAP_PARAMETERS = 'flexibility,damping,internal_damping,torsion'
 HANGING_PARAMETERS = 'flexibility,length_scale'
 MANY_EVALUATIONS = '400'  # of cables and wires, in as many parts as their trials support
-HANGING_NODES = '61'
+HANGING_NODES = '121'  # the bend at a clamp is a few centimetres long, see elastica.py
 WIRE = 1.5  # m
 
 
