@@ -25,7 +25,7 @@ import atexit
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import connection, parent_process
+from multiprocessing import connection, parent_process, resource_tracker
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 import os
@@ -210,6 +210,8 @@ class _Process(SpawnProcess):
     """A spawned process that starts deaf to signals and without the parent's main module."""
 
     def start(self) -> None:
+        # The first start of all starts Python's resource tracker, too, which ends by unblocking signals.
+        resource_tracker.ensure_running()
         # The main module may be one that loads rclpy; a child needs nothing from it.
         with _starting, _blocked_signals():
             main = sys.modules['__main__']
