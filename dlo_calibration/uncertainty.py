@@ -22,7 +22,8 @@ formula says, because alone it is several times too small for real DLOs:
 - neighbouring points err alike, so that they count as fewer;
 - the initial chain of each trial is measured, too, and with it the length and the shape of the DLO;
 - where the model cannot explain the residuals, the trials disagree with each
-  other, and how far says more than how many points there are;
+  other, and how far says more than how many points there are (the larger of what leaving one
+  out and drawing as many anew tell);
 - the step and the nodes of the simulation move the optimum.
 
 Where it did not, as in a random search, the good evaluations lie apart.
@@ -47,6 +48,7 @@ CONFIDENCE = 0.9  # that the truth lies in an interval
 DEVIATIONS = 1.645  # that half such an interval has, of a normal distribution
 AT_BOUND = 0.002
 MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
+DRAWS = 200  # of the bootstrap over trials
 FEWEST_TRIALS = 3  # whose disagreement says something
 SMALLEST_RESIDUAL = 1e-9  # m; of a model that explains everything
 REMAINING = 2.0  # times the change by a simulation twice as fine is missing: the error is of first order
@@ -188,7 +190,9 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
     covariance = scale**2 * np.linalg.inv(information + prior)
     extra = np.zeros(len(point))
     if len(shapes) >= FEWEST_TRIALS and not residual < MODEL_ERROR * noise:
-        disagreement = np.var(left_out(right, matrix, shapes, prior), axis=0) * (len(shapes) - 1)
+        disagreement = np.maximum(
+            np.var(left_out(right, matrix, shapes, prior), axis=0) * (len(shapes) - 1),
+            np.var(drawn_again(right, matrix, shapes, prior), axis=0))
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (REMAINING * shift)**2
@@ -228,6 +232,25 @@ def left_out(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, in
         rest = information - jacobian[rows].T @ jacobian[rows] + prior
         moved.append(-np.linalg.solve(rest, gradient - jacobian[rows].T @ residuals[rows]))
     return np.array(moved)
+
+
+def drawn_again(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], prior: Floats,
+                draws: int = DRAWS) -> Floats:
+    """
+    Return (draws, d): how far the optimum moves where as many of the T trials are drawn, with replacement.
+
+    The bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 6), each by one
+    Gauss-Newton step from the common optimum; the same draws each time.
+
+    :param prior: (d, d) added to the information matrix [m^2 per unit cube squared].
+    """
+    rows = _rows(shapes)
+    informations = np.array([jacobian[one].T @ jacobian[one] for one in rows])
+    gradients = np.array([jacobian[one].T @ residuals[one] for one in rows])
+    counts = np.random.default_rng(0).multinomial(len(rows), np.full(len(rows), 1 / len(rows)), size=draws)
+    matrices = np.tensordot(counts, informations, axes=1) + prior
+    moved: Floats = -np.linalg.solve(matrices, (counts @ gradients)[..., None])[..., 0]
+    return moved
 
 
 def _rows(shapes: Sequence[tuple[int, int]]) -> list[slice]:

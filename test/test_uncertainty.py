@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.uncertainty import (
+    drawn_again,
     from_jacobian,
     good_count,
     independence,
@@ -181,6 +182,18 @@ def test_leaving_a_trial_out_moves_the_optimum_as_a_new_fit_would():
     at = 3 * SHAPES[0][0] * SHAPES[0][1]
     again, _ = fitted(jacobian[at:], errors[at:])
     assert left_out(residuals, jacobian, SHAPES)[0] == pytest.approx(again - moved, abs=1e-6)
+
+
+def test_trials_drawn_again_scatter_as_their_mean_does():
+    # One parameter that each of 12 trials measures for itself: its mean has the standard error s / sqrt(T).
+    count = 12
+    values = np.random.default_rng(6).normal(0, 0.02, count)
+    values -= values.mean()
+    jacobian = np.ones((30 * count, 1))
+    moved = drawn_again(np.repeat(-values, 30), jacobian, [(2, 5)] * count, np.zeros((1, 1)), draws=4000)
+    assert moved.shape == (4000, 1)
+    assert moved.std() == pytest.approx(values.std() / np.sqrt(count), rel=0.05)
+    assert moved.mean() == pytest.approx(0, abs=3e-4)
 
 
 def test_a_parameter_without_effect_is_not_excited_and_can_be_anything():
