@@ -14,11 +14,18 @@
 
 """What least squares promises by itself: few evaluations, the lower minimum, no pull by outliers."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from dlo_calibration.compiled import CompiledSimulator
+from dlo_calibration.config import Options
+from dlo_calibration.evaluation import Evaluator
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.search.huber import Huber
+from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.worker import hints as known_from
 
 TRUTH = np.array([0.62, 0.35, 0.5])
 
@@ -151,3 +158,17 @@ def test_hubers_loss_is_quadratic_then_linear():
     normal = np.random.default_rng(1).normal(scale=0.002, size=4000)
     assert Huber.of(normal).scale == pytest.approx(1.345 * 0.002, rel=0.05)
     assert Huber.of(np.zeros(4)).scale > 0
+
+
+
+def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_place():
+    # Of sample object2, both end where the DLO stretches too easily, and less friction makes up for it.
+    session = read_session(Path(__file__).resolve().parent.parent / 'msg_samples/object2', None)
+    options = Options.of(session.options or {})
+    trials, _ = session_trials(session, options)
+    evaluator = Evaluator(trials, options.space, CompiledSimulator())
+    search = LeastSquares(options.space.dimension, 10, known_from(trials, options))
+    while len(points := search.ask(150)):
+        search.tell([Observation(e.point, e.score, e.residuals)
+                     for e in (evaluator.evaluate(0, point) for point in points)])
+    assert evaluator.evaluate(0, search.best).errors.mean < 2e-3

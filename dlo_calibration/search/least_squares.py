@@ -133,6 +133,14 @@ class LeastSquares(PlannedSearch):
                 best = descent
         if not best.ended:
             best = yield from self._descend(best, None, ())
+        if not looked and not self._hints.found:
+            self._keep(best)
+            for begun in (yield from self._look_beyond(best)):
+                descent = yield from self._descend(begun, best, ())
+                if lower(descent.residuals, best.residuals):
+                    best, found = descent, 1
+            if not best.ended:
+                best = yield from self._descend(best, None, ())
         best = yield from self._polish(best)
         self._keep(best)
         return best.ended + (f'; reached from {found} starts' if found > 1 else '')
