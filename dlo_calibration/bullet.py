@@ -37,7 +37,7 @@ from dlo_calibration.parameters import GRAVITY
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.scene import Obstacle, read_scene, unusable
-from dlo_calibration.simulator import Rollout
+from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
 from dlo_calibration.trial import Trial
 
 
@@ -62,8 +62,6 @@ def _silence() -> Iterator[None]:
 with _silence():  # it greets every process with its build time, in the middle of a progress bar
     import pybullet
 
-DEFAULT_NODES = 41
-DEFAULT_TIME_STEP = 0.003  # s
 ROPE_GROUP = 1 << 6  # collision group whose members do not collide with each other in Bullet
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 INERTIA = 1e6  # kg m^2: spheres slide, they do not roll

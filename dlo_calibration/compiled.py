@@ -33,7 +33,7 @@ from dlo_calibration.layout import Layout, rest_on, resting_level
 from dlo_calibration.parameters import GRAVITY
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
-from dlo_calibration.simulator import Rollout
+from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
 from dlo_calibration.trial import Trial
 
 NO_PATH = np.empty((0, 0, 3))
@@ -130,8 +130,8 @@ class CompiledSimulator:
 
     name = 'compiled'
 
-    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = 41,
-                 time_step: float = 0.003, stable_distance: float = Settling.distance,
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
+                 time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
                  stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
         self._table_height = table_height if table else None
         self._nodes = nodes

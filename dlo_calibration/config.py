@@ -36,6 +36,7 @@ from dlo_calibration.parameters import (
     SCALE,
 )
 from dlo_calibration.search import SEARCHES
+from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP
 
 AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
 CONFIRMING = 'bullet'
@@ -128,8 +129,9 @@ class Options:
     scheduler: str = _option(
         '', 'address of a Dask scheduler whose workers simulate, on any number of machines, e.g. '
         'tcp://host:8786; workers has no effect then; empty: this machine alone')
-    nodes: int = _option(41, 'point masses of the simulated DLO', minimum=8, maximum=1000)
-    time_step: float = _option(0.003, 'simulation time step', unit='s', minimum=0.0001, maximum=0.02)
+    nodes: int = _option(DEFAULT_NODES, 'point masses of the simulated DLO', minimum=8, maximum=1000)
+    time_step: float = _option(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,
+                               maximum=0.02)
     stable_distance: float = _option(
         0.0005, 'a DLO is stable when all its points moved less than this within stable_time',
         unit='m', minimum=1e-6, maximum=0.1)

@@ -34,21 +34,20 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import calibrate, CalibrationResult
+from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation import Evaluator
-from dlo_calibration.parts import calibrate_parts
-from dlo_calibration.search import SEARCHES
 from dlo_calibration.trial import Trial
-from dlo_calibration.worker import hints, SimulatorFactory
+from dlo_calibration.worker import fitted_with, SimulatorFactory
 
 #: Options that change nothing in what a calibration finds.
 WITHOUT_EFFECT = ('workers', 'scheduler', 'start_after_trials', 'output_directory', 'record')
 #: Modules that only show what others found: a change there makes no calibration obsolete.
-SHOWING = ('animation', 'cli', 'demo', 'experiment_report', 'experiment_summary', 'experiment_verb',
-           'findings', 'markers', 'node', 'options_node', 'picture', 'plot', 'recorder', 'report', 'terminal')
+SHOWING = ('animation', 'charts', 'cli', 'demo', 'experiment_report', 'experiment_summary', 'experiment_verb',
+           'figures', 'findings', 'markers', 'node', 'options_node', 'picture', 'plot', 'recorder', 'report',
+           'reporter', 'slices', 'terminal')
 
 
 @dataclass(frozen=True)
@@ -199,12 +198,9 @@ def perform(task: Task, make_simulator: SimulatorFactory,
     :raises CancelledError: when stopped.
     """
     options, trials = task.options, task.trials
-    search = SEARCHES[task.search](options.space.dimension, task.seed, hints(trials, options))
     with closing(make_simulator(options)) as simulator:
         try:
-            fitted = calibrate if options.parts else calibrate_parts
-            result = fitted(trials, options.space, simulator, search, budget=options.evaluations,
-                            seed=task.seed, should_stop=should_stop)
+            result = fitted_with(trials, options, simulator, should_stop=should_stop)
         except SimulationError as error:
             if should_stop():
                 raise CancelledError from error
@@ -224,9 +220,10 @@ def judged_chains(task: Task, outcome: Outcome, make_simulator: SimulatorFactory
                   ) -> list[tuple[Trial, Floats]]:
     """Return the trials that a task is judged by, each with its simulated (g, n, 3) [m] goals."""
     judges, found = task.judges, []
+    space = replace(task.options.space, free=tuple(outcome.values))  # of as many parts as were found
     with closing(make_simulator(judges.options)) as simulator:
         for trial in judges.trials:
-            physical = task.options.space.physical(outcome.values, trial.initial.length)
+            physical = space.physical(outcome.values, trial.initial.length)
             try:
                 found.append((trial, simulator.simulate(trial, physical).chains))
             except SimulationError:

@@ -75,28 +75,9 @@ def calibrate_parts(trials: Sequence[Trial], space: ParameterSpace, simulator: S
 
     if not divisible:
         return fitted(space, search, budget)
-    best = latest = fitted(space, search, max(1, math.ceil(FIRST_SHARE * budget)))
-    count, why = _examined(best), ''
-    while _examined(latest) and 2 * latest.space.parts <= MOST_PARTS:
-        finer, start = latest.space.halved(latest.best.point)
-        left = budget - len(taken)
-        if left < FEWEST_LEFT * finer.dimension:
-            why = f'the budget of {budget} evaluations is too small to try {finer.parts}'
-            break
-        try:
-            latest = fitted(finer, LeastSquares(finer.dimension, 0, Hints.at(start)), left)
-        except SimulationError:  # those before stand
-            why = f'{finer.parts} could not be simulated'
-            break
-        count += _examined(latest)
-        if not _examined(latest):
-            why = f'stopped before {finer.parts} were fitted'
-        elif _better(latest, best):
-            best, why = latest, ''
-        else:
-            why = f'{finer.parts} would not predict left-out trials better'
-            if finer.parts > EVEN_HALVES * space.parts:
-                break
+    even = fitted(space, search, max(1, math.ceil(FIRST_SHARE * budget)))
+    best, count, why = _divided(even, lambda finer, search: fitted(finer, search, budget - len(taken)),
+                                lambda: budget - len(taken))
     before = _examined(best)
     if before:
         best = examined(best, simulator, should_stop=should_stop, executor=executor)
@@ -106,6 +87,36 @@ def calibrate_parts(trials: Sequence[Trial], space: ParameterSpace, simulator: S
     evaluations = tuple(_restated(evaluation, tried, best.space) for tried, evaluation in taken)
     return replace(best, evaluations=evaluations, seconds=time.monotonic() - started, stop_reason=reason,
                    examination=best.examination and replace(best.examination, evaluations=count))
+
+
+def _divided(even: CalibrationResult, fitted: Callable[[ParameterSpace, Search], CalibrationResult],
+             left: Callable[[], int]) -> tuple[CalibrationResult, int, str]:
+    """
+    Cut every part in two as long as that predicts better.
+
+    :param left: evaluations of the budget.
+    :returns: the best result, how many parameter sets were examined in all, and why it has no more parts.
+    """
+    best = latest = even
+    count, why = _examined(even), ''
+    while _examined(latest) and 2 * latest.space.parts <= MOST_PARTS:
+        finer, start = latest.space.halved(latest.best.point)
+        if left() < FEWEST_LEFT * finer.dimension:
+            return best, count, f'too few evaluations are left of the budget to try {finer.parts}'
+        try:
+            latest = fitted(finer, LeastSquares(finer.dimension, 0, Hints.at(start)))
+        except SimulationError:  # those before stand
+            return best, count, f'{finer.parts} could not be simulated'
+        count += _examined(latest)
+        if not _examined(latest):
+            return best, count, f'stopped before {finer.parts} were fitted'
+        if _better(latest, best):
+            best, why = latest, ''
+        else:
+            why = f'{finer.parts} would not predict left-out trials better'
+            if finer.parts > EVEN_HALVES * even.space.parts:
+                break
+    return best, count, why
 
 
 def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpace) -> Evaluation:

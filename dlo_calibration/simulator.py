@@ -25,6 +25,9 @@ from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.trial import Trial
 
+DEFAULT_NODES = 41
+DEFAULT_TIME_STEP = 0.003  # s
+
 
 @dataclass(frozen=True)
 class Rollout:

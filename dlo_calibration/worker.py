@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
+from concurrent.futures import Executor
 from contextlib import closing, ExitStack
 from dataclasses import dataclass, replace
 import math
@@ -97,9 +98,6 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         notices.append(text)
         on_notice(text)
 
-    known = hints(trials, options)
-    space, guessed = _guessed(options.space, known)
-    search = SEARCHES[options.search](space.dimension, options.seed, known)
     with ExitStack() as stack:
         executor = _executor(options, notice, on_notice)  # its processes start while the engine is made
         if executor is not None:
@@ -107,15 +105,29 @@ def calibrate_with(trials: Sequence[Trial], options: Options, make_simulator: Si
         simulator = stack.enter_context(closing(make_simulator(options)))
         if executor is not None:
             simulator.prepare()
-        fitted = calibrate if options.parts else calibrate_parts
-        result = fitted(
-            trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
-            on_evaluation=on_evaluation, should_stop=should_stop, executor=executor)
-        result = _noted(advised(result, simulator, should_stop), guessed)
-        result = explained(result, simulator, should_stop)
+        result = fitted_with(trials, options, simulator, on_evaluation, should_stop, executor)
+        result = explained(advised(result, simulator, should_stop), simulator, should_stop)
     told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     result = replace(result, warnings=(*result.warnings, *told))
     return confirmed_with(result, options, make_simulator, should_stop)
+
+
+def fitted_with(trials: Sequence[Trial], options: Options, simulator: Simulator,
+                on_evaluation: Callable[[Evaluation], None] | None = None,
+                should_stop: Callable[[], bool] = lambda: False,
+                executor: Executor | None = None) -> CalibrationResult:
+    """
+    Search as `options` say, on a simulator that is there, and examine what was found; no more than that.
+
+    :raises DloCalibrationError: where there is no result.
+    """
+    known = hints(trials, options)
+    space, guessed = _guessed(options.space, known)
+    search = SEARCHES[options.search](space.dimension, options.seed, known)
+    method = calibrate if options.parts else calibrate_parts
+    return _noted(method(
+        trials, space, simulator, search, budget=options.evaluations, seed=options.seed,
+        on_evaluation=on_evaluation, should_stop=should_stop, executor=executor), guessed)
 
 
 def hints(trials: Sequence[Trial], options: Options) -> Hints:

@@ -37,6 +37,7 @@ from dlo_calibration.experiment import (
     Task,
     tasks,
 )
+from dlo_calibration.parameters import BY_NAME
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.trial import Trial
 from dlo_calibration.worker import hints
@@ -92,6 +93,19 @@ def test_what_is_found_is_judged_by_the_trial_that_was_left_out():
     assert trial.name == judged.trial == 'trial 2'
     assert judged.error == pytest.approx(distances.mean())
     assert judged.share == pytest.approx(100 * distances.mean() / trial.initial.length)
+
+
+def test_parts_that_were_found_are_simulated_where_a_trial_judges():
+    seen = []
+
+    class Watching(ToySimulator):
+        def simulate(self, trial, physical):
+            seen.append(physical)
+            return super().simulate(trial, physical)
+
+    found = Outcome({'flexibility': 40.0, 'stiffness_2': 75.0})
+    judged_chains(task(left_out=1), found, lambda options: Watching())
+    assert seen[0]['stiffness_2'] == BY_NAME['stiffness_2'].physical(75.0)
 
 
 def test_what_is_judged_by_has_no_part_in_what_is_found():

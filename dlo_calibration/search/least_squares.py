@@ -112,7 +112,7 @@ class LeastSquares(PlannedSearch):
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
         found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
-        while found < 2 and checks < MOST_CHECKS and not self._hints.found:
+        while found < 2 and checks < MOST_CHECKS and not self._hints.refines:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
             if not best.ended and not best.rivals(starts):
                 best = yield from self._descend(best, None, ())
@@ -133,7 +133,7 @@ class LeastSquares(PlannedSearch):
                 best = descent
         if not best.ended:
             best = yield from self._descend(best, None, ())
-        if not looked and not self._hints.found:
+        if not looked and not self._hints.refines:
             self._keep(best)
             for begun in (yield from self._look_beyond(best)):
                 descent = yield from self._descend(begun, best, ())
@@ -212,7 +212,7 @@ class LeastSquares(PlannedSearch):
         count = 2 ** int(np.ceil(np.log2(max(FEWEST_STARTS, STARTS_PER_PARAMETER * self._dimension))))
         sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
         hint = np.clip(self._hints.start, 0, 1)
-        if self._hints.found:
+        if self._hints.refines:
             observations = yield hint[None, :]
             if observations[0].residuals is not None:
                 return list(observations)

@@ -53,7 +53,7 @@ class Hints:
     :param rows: how many residuals each of T trials has, in order; empty where
         that is not known.
     :param excites: (T, d) True where a trial excites a parameter.
-    :param found: `start` is where a search of a simpler model ended: no other start is worth a try.
+    :param refines: `start` is where a search of a simpler model ended: no other start is worth a try.
     """
 
     start: Floats
@@ -61,7 +61,7 @@ class Hints:
     upper: Floats
     rows: tuple[int, ...]
     excites: NDArray[np.bool_]
-    found: bool = False
+    refines: bool = False
 
     def __post_init__(self) -> None:
         for name in ('start', 'lower', 'upper'):
@@ -79,7 +79,7 @@ class Hints:
     @classmethod
     def at(cls, start: Floats) -> Hints:
         """Return hints that (d,) `start` is where a search of a simpler model ended."""
-        return replace(cls.none(len(start)), start=start, found=True)
+        return replace(cls.none(len(start)), start=start, refines=True)
 
     @property
     def excited(self) -> NDArray[np.bool_]:
