@@ -15,10 +15,13 @@ HEADER = """\
 """
 
 
+def beginning(file):
+    return file.read_text(encoding='utf-8').removeprefix('#!/usr/bin/env python3\n')
+
+
 def test_files_begin_with_the_licence_header():
     """The first lines of setup.py are the ones to copy."""
-    without = [str(file.relative_to(ROOT)) for file in FILES
-               if not file.read_text(encoding='utf-8').removeprefix('#!/usr/bin/env python3\n').startswith(HEADER)]
+    without = [str(file.relative_to(ROOT)) for file in FILES if not beginning(file).startswith(HEADER)]
     assert not without
 
 

@@ -16,6 +16,7 @@ import time
 
 from processes import children
 import pytest
+import toy_calibrator
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import Deadly, ToySimulator
 
@@ -44,7 +45,7 @@ from dlo_calibration.node import CalibratorNode  # noqa: E402
 
 PATIENCE = 60.0  # s
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-CHILD = Path(__file__).parent / 'toy_calibrator.py'
+CHILD = Path(toy_calibrator.__file__)
 TYPES = rclpy_types()
 LOG_WARN = 30  # rcl_interfaces/msg/Log
 
