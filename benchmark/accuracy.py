@@ -69,7 +69,7 @@ def estimate(fitted: dict[str, Any], name: str) -> str:
 
 def reference(folder: Path, options: list[str]) -> str:
     """Tabulate the five reference objects: fitted on four trials, judged on five other actions."""
-    from dlo_calibration.parameters import BY_NAME
+    from dlo_calibration.model.parameters import BY_NAME
 
     data = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data'))
     rows = ['| object | fitted mean error, mm | score | other actions mean error, mm | score '

@@ -22,9 +22,9 @@ import numpy as np
 
 from dlo_calibration import ParameterSpace, SimulationError, Trial
 from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.chain import Floats
 from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulator import Simulator
 

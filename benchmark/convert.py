@@ -53,7 +53,6 @@ from typing import Any, Iterator, Mapping, Sequence, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Chain
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.messages import (
     ACTION,
@@ -66,6 +65,7 @@ from dlo_calibration.messages import (
     INITIAL,
     INPUT_TYPES,
 )
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.session import encode, SessionWriter
 
 Floats = NDArray[np.float64]

@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.evaluation import Evaluator
-from dlo_calibration.parameters import BY_NAME, GRAVITY
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.session import read_session, session_trials
 

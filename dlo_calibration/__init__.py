@@ -12,14 +12,14 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dlo_calibration.action import Action, Hand
     from dlo_calibration.calibration import calibrate, CalibrationResult
-    from dlo_calibration.chain import Chain
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
     from dlo_calibration.evaluation import Evaluation
-    from dlo_calibration.parameters import Parameter, PARAMETERS, ParameterSpace
+    from dlo_calibration.model.action import Action, Hand
+    from dlo_calibration.model.chain import Chain
+    from dlo_calibration.model.parameters import Parameter, PARAMETERS, ParameterSpace
+    from dlo_calibration.model.trial import Goal, Trial
     from dlo_calibration.simulator import Rollout, Simulator
-    from dlo_calibration.trial import Goal, Trial
 
 __all__ = [
     'PARAMETERS', 'Action', 'CalibrationResult', 'Chain', 'DloCalibrationError', 'Evaluation', 'Goal',
@@ -28,11 +28,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    'action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult'),
-    'chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
+    'model.action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult'),
+    'model.chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
     'evaluation': ('Evaluation',),
-    'parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulator': ('Rollout', 'Simulator'),
-    'trial': ('Goal', 'Trial'),
+    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulator': ('Rollout', 'Simulator'),
+    'model.trial': ('Goal', 'Trial'),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -11,7 +11,8 @@ from typing import Any, Mapping
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.picture import (
     add_legend,
     as_text,
@@ -23,7 +24,6 @@ from dlo_calibration.picture import (
     View,
 )
 from dlo_calibration.simulator import Simulator
-from dlo_calibration.trial import Goal, Trial
 
 FRAME_RATE = 10  # 1/s; GIF counts time in 0.01 s
 MOST_FRAMES = 120  # of the motion; a longer one is shown faster

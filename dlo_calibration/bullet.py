@@ -19,15 +19,15 @@ from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.contact import SelfContact
 from dlo_calibration.layout import feature_shares, Layout, rest_on, resting_level, spread_places
-from dlo_calibration.parameters import GRAVITY
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.parameters import GRAVITY
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.scene import Obstacle, read_scene, unusable
 from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
-from dlo_calibration.trial import Trial
 
 
 @contextmanager

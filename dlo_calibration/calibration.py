@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.advice import Advice, advise
-from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, Limits, mean_length
 from dlo_calibration.examination import Examination, examine
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.noise import NO_NOISE, noise, smooth
-from dlo_calibration.parameters import ParameterSpace, SCALE
-from dlo_calibration.score import PointErrors
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.simulator import Simulator
-from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spread_of_best, Uncertainty
 from dlo_calibration.unexplained import Explanation, explanations
 

@@ -12,7 +12,7 @@ from typing import Iterable
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 
 WIDTH, HEIGHT = 460, 320  # of a chart, in the units of its text: 13 to a line
 LEFT, RIGHT, TOP, BOTTOM = 62, 14, 30, 48  # margins around the axes

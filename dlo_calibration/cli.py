@@ -24,11 +24,11 @@ from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation import Evaluator
 from dlo_calibration.experiment import Observed
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.trial import Trial
 from dlo_calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 
 PROGRAM = 'dlo-calibration'

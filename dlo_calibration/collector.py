@@ -46,8 +46,8 @@ from typing import Iterable
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import INITIAL
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.segment import Key, Message, order, Segment
-from dlo_calibration.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 

@@ -15,7 +15,7 @@ from typing import Any, Iterator, Mapping
 
 from dlo_calibration.calibration import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
-from dlo_calibration.parameters import (
+from dlo_calibration.model.parameters import (
     BY_NAME,
     measured,
     MOST_PARTS,

@@ -10,8 +10,8 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
-from dlo_calibration.score import PointErrors
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.score import PointErrors
 
 #: Mean distance [m] between two engines' points of a trial from which on they disagree: about the
 #: error of nodes and time step themselves, 0.43 mm on the reference objects (doc/physics.md).

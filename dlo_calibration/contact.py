@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 
 Indices = NDArray[np.intp]
 

@@ -14,7 +14,7 @@ from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.gain import Gain
 from dlo_calibration.messages import MessageTypes
-from dlo_calibration.parameters import measured
+from dlo_calibration.model.parameters import measured
 
 OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',

@@ -20,13 +20,13 @@ import weakref
 
 import numpy as np
 
-from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Search
 from dlo_calibration.simulator import Rollout, Simulator
-from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import matters_below
 
 

@@ -17,8 +17,8 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Floats, frozen_array
-from dlo_calibration.score import PointErrors
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.score import PointErrors
 from dlo_calibration.uncertainty import (
     DEVIATIONS,
     from_jacobian,

@@ -24,11 +24,11 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation import Evaluator
-from dlo_calibration.trial import Trial
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.worker import fitted_with, SimulatorFactory
 
 #: Options that change nothing in what a calibration finds.

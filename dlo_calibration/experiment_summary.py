@@ -11,7 +11,7 @@ from typing import Iterator, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.experiment import Outcome, Task
-from dlo_calibration.score import VERY_SIMILAR
+from dlo_calibration.model.score import VERY_SIMILAR
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.gain import silent
-from dlo_calibration.parameters import BY_NAME, PER_WEIGHT, SCALE
+from dlo_calibration.model.parameters import BY_NAME, PER_WEIGHT, SCALE
 from dlo_calibration.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.unexplained import PARTS
 

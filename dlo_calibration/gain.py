@@ -21,12 +21,12 @@ import numpy as np
 
 from dlo_calibration.advice import sensitivity
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.excitation import excites, priors
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.noise import noise
-from dlo_calibration.parameters import ParameterSpace, SCALE
 from dlo_calibration.simulator import Simulator
-from dlo_calibration.trial import Goal, shown_goals, Trial
 from dlo_calibration.uncertainty import UNKNOWN_STD
 
 NEW = 0.6  # share of the standard deviation that is left, at most, where a trial tells something: a repeat of

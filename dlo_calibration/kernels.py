@@ -18,7 +18,6 @@ from typing import Any, Callable, TypeVar
 import numba
 import numpy as np
 
-from dlo_calibration.chain import Floats
 from dlo_calibration.contact import (
     FASTEST_PUSH_OUT,
     ITERATIONS,
@@ -28,6 +27,7 @@ from dlo_calibration.contact import (
     UNSUPPORTED,
     WEDGED,
 )
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.natural import HAIRPIN, ROUNDED
 from dlo_calibration.rod import HELD
 from dlo_calibration.twist import ANGLE, BEGUN, COLUMNS, END, FIRST, LAST, START, STIFFNESS

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.action import Hand
-from dlo_calibration.chain import Chain, Floats, frozen_array, interpolation_matrix
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import Hand
+from dlo_calibration.model.chain import Chain, Floats, frozen_array, interpolation_matrix
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.noise import NO_NOISE, noise, smooth
-from dlo_calibration.trial import Trial
 
 RESTING_BAND = 0.006  # m; points of a resting chain are that near to its lowest one
 RESTING_SHARE = 0.15  # of the points, at least, lie in the band of a chain that rests

@@ -13,9 +13,9 @@ from typing import Any, Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.action import MAXIMUM_HANDS, MAXIMUM_NORM, MINIMUM_NORM, quaternion_lengths
-from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import MAXIMUM_HANDS, MAXIMUM_NORM, MINIMUM_NORM, quaternion_lengths
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
 INPUT_TYPES: Mapping[str, str] = {

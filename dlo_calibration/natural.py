@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 
 ROUNDED = 0.05  # rad of the bends in all below which the direction of the curvature is not settled
 HAIRPIN = 0.01  # least squared cosine of half the angle between two segments

@@ -10,8 +10,8 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_calibration.chain import Floats
-from dlo_calibration.trial import Trial
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Trial
 
 ORDERS = range(2, 9)  # of the differences; more do not separate curve and noise any better
 FEWEST_POINTS = 5  # of a chain that tells bending from noise

@@ -10,10 +10,10 @@ from typing import Any, Mapping, Sequence, TYPE_CHECKING
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
 from dlo_calibration.errors import InputError
-from dlo_calibration.score import PointErrors, residuals
-from dlo_calibration.trial import shown_goals, Trial
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.score import PointErrors, residuals
+from dlo_calibration.model.trial import shown_goals, Trial
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Callable, Mapping, Sequence
 
 from dlo_calibration.animation import simulated_motion, write_animation
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.picture import trial_picture, unwritable
 from dlo_calibration.simulator import Simulator
-from dlo_calibration.trial import Trial
 
 
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,

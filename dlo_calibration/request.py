@@ -19,12 +19,12 @@ from typing import Any, Mapping, Union
 
 import numpy as np
 
-from dlo_calibration.action import Action, Hand, NO_ROTATION
-from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.named_actions import NAMED_ACTIONS, NamedAction
-from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.model.action import Action, Hand, NO_ROTATION
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.xml import (
     add,
     add_chain,

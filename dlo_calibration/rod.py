@@ -35,10 +35,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from dlo_calibration.chain import Floats
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import PART_NAMES
 from dlo_calibration.natural import natural_forces
-from dlo_calibration.parameters import PART_NAMES
 from dlo_calibration.twist import COLUMNS, spans_between, twist_forces
 
 Indices = NDArray[np.intp]

@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats, frozen_array
 
 EXPECTED = 'a URDF file with collision shapes'
 FRICTION = 1.0  # of a link that gives none, like the table's

@@ -10,12 +10,12 @@ from typing import Iterable, Union
 
 import numpy as np
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Floats
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
-from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Goal, Trial
 
 Message = Union[ChainMessage, ActionMessage]
 Key = tuple[int, int, tuple[str, ...]]

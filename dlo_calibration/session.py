@@ -31,6 +31,7 @@ from dlo_calibration.messages import (
     INPUT_TYPES,
     read,
 )
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.recording import (
     METADATA_FILE,
     METADATA_KEY,
@@ -39,7 +40,6 @@ from dlo_calibration.recording import (
     SessionWriter,
     typestore,
 )
-from dlo_calibration.trial import Trial
 from dlo_calibration.trial_messages import trial_messages
 
 __all__ = ['Record', 'RecordingError', 'Session', 'SessionWriter', 'decode', 'encode', 'read_session',

@@ -10,9 +10,9 @@ from typing import Mapping, Protocol
 
 import numpy as np
 
-from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.trial import Trial
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.trial import Trial
 
 DEFAULT_NODES = 41
 DEFAULT_TIME_STEP = 0.003  # s

@@ -11,7 +11,7 @@ from typing import Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import bezier_curve, Floats
+from dlo_calibration.model.chain import bezier_curve, Floats
 
 STEPS = 200  # of the integration, about
 FEWEST_STEPS = 3  # per segment

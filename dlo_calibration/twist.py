@@ -22,7 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.natural import frame_along, HAIRPIN
 
 #: columns of a span: its first and last segment, torque per angle [N m], angle, whether it has begun;

@@ -26,7 +26,7 @@ from typing import Protocol, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Floats, frozen_array
 
 BEST_SHARE = 0.05  # of the evaluations count as good,
 BEST_MINIMUM = 8  # but never fewer than that many

@@ -23,12 +23,12 @@ from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation import Evaluation
-from dlo_calibration.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.slices import cut, Slices
-from dlo_calibration.trial import Trial
 from dlo_calibration.uncertainty import good_count
 
 GUESSED = 'no trial tells anything about it; guessed from the height at which the DLO lies'

@@ -24,9 +24,9 @@ from typing import Any, Iterator, Mapping
 from lxml import etree
 import numpy as np
 
-from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.config import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Chain, Floats
 
 VERSION = '1'  # of both kinds of document
 MAXIMUM_SIZE = 64 * 2**20  # bytes

@@ -20,12 +20,12 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.description import write_result
 from dlo_calibration.engines import make_simulator
-from dlo_calibration.named_actions import (
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.named_actions import (
     Drag,
     GraspAndPlace,
     LiftAndHold,

@@ -12,7 +12,7 @@ from toy_simulator import toy_trial, ToySimulator
 from dlo_calibration import calibrate, Chain, Goal, ParameterSpace, Rollout, SimulationError, Trial
 from dlo_calibration.advice import advise, candidates, expected_std
 from dlo_calibration.calibration import advised
-from dlo_calibration.named_actions import NAMED_ACTIONS
+from dlo_calibration.model.named_actions import NAMED_ACTIONS
 from dlo_calibration.search import SEARCHES
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}

@@ -15,7 +15,7 @@ from toy_simulator import ToySimulator
 from dlo_calibration.appraiser import Appraiser
 from dlo_calibration.config import Options
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.trial import Goal
+from dlo_calibration.model.trial import Goal
 from dlo_calibration.worker import calibrate_with
 
 PATIENCE = 60.0

@@ -14,40 +14,22 @@ import pytest
 PACKAGE = 'dlo_calibration'
 FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 
-#: A module imports only from those before it; the modules of a subpackage share its place.
-ORDER = (
-    # pure NumPy and SciPy
-    'errors', 'samples', 'chain', 'action', 'named_actions', 'trial', 'parameters', 'simulator', 'score',
-    'noise', 'layout', 'suspension', 'estimate', 'excitation',
-    'search', 'confirmation', 'uncertainty', 'evaluation', 'examination', 'advice', 'unexplained',
-    'calibration', 'parts',
-    '__init__', 'config', 'parameter_file', 'gain', 'findings', 'slices',
-    # messages and files
-    'messages', 'diagnostics', 'markers', 'segment', 'trial_messages',
-    'collector', 'recording', 'xml', 'description',
-    'request', 'session',
-    # engines
-    'rollout', 'contact', 'natural', 'twist', 'rod', 'scene', 'bullet', 'kernels', 'compiled', 'engines',
-    # edges
-    'pool', 'cluster', 'worker', 'appraiser', 'experiment', 'experiment_summary', 'picture', 'animation',
-    'plot', 'terminal', 'charts', 'figures', 'report', 'reporter', 'experiment_report', 'experiment_verb',
-    'signals', 'recorder', 'options_node', 'node',
-    'calibrator', 'cli', '__main__', 'demo',
-)
+#: The rooms of the house, in the order in which data flows: a room imports only from those before it.
+ROOMS = ('model', 'observation', 'simulation', 'evaluation', 'search', 'inference', 'calibration', 'planning',
+         'messages', 'files', 'capture', 'export', 'report', 'experiment', 'ros', 'cli')
+#: Modules outside the rooms, which every room may import.
+SHARED = ('errors', 'signals')
 
-#: The only modules that may import something, be it at the top or inside a function.
+#: Where in the package something may be imported, be it at the top of a module or inside a function.
 ONLY = {
-    # the demo stands for the robot, on the other side of the graph
-    'rclpy': {'options_node', 'node', 'demo'},
-    'pybullet': {'bullet'},
-    'numba': {'kernels'},
-    'cma': {'search'},
-    'lxml': {'xml'},
-    'distributed': {'cluster'},
-    'dlo_calibration.bullet': {'engines'},
-    'dlo_calibration.compiled': {'engines'},
-    'dlo_calibration.engines': {'node', 'cli'},
-    'dlo_calibration.trial': set(ORDER) - {'search'},
+    'rclpy': ('ros', 'cli/demo.py'),  # the demo stands for the robot, on the other side of the graph
+    'pybullet': ('simulation/bullet.py',),
+    'numba': ('simulation/kernels.py',),
+    'cma': ('search/cma_es.py',),
+    'lxml': ('files/xml.py',),
+    'distributed': ('evaluation/cluster.py',),
+    'dlo_calibration.simulation.bullet': ('calibration/engines.py',),
+    'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
 NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.optimize', 'cma')
@@ -55,10 +37,9 @@ NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.
 FILES = sorted(FOLDER.rglob('*.py'))
 
 
-def place(file: Path) -> str:
-    """Name the entry of ORDER that a file belongs to."""
-    first, *rest = file.relative_to(FOLDER).parts
-    return first if rest else file.stem
+def room(file: Path) -> str:
+    """Name the room that a file is in; nothing for one outside the rooms."""
+    return file.relative_to(FOLDER).parts[0] if file.parent != FOLDER else ''
 
 
 def imported(file: Path) -> set[str]:
@@ -74,31 +55,35 @@ def imported(file: Path) -> set[str]:
     return names
 
 
-def own_places(names: set[str]) -> set[str]:
-    """List the entries of ORDER among imported names; the bare package is its `__init__`."""
-    parts = [name.split('.') for name in names if name.split('.')[0] == PACKAGE]
-    found = {part[1] for part in parts if len(part) > 1 and part[1] in ORDER}
-    named_in_init = any(len(part) > 1 and part[1] not in ORDER for part in parts)
-    return found | ({'__init__'} if named_in_init else set())
+def rooms_of(names: set[str]) -> set[str]:
+    """List the rooms that imported names are in."""
+    return {name.split('.')[1] for name in names if name.startswith(f'{PACKAGE}.')} & set(ROOMS)
 
 
-def test_every_module_has_its_place_in_the_order():
-    assert {place(file) for file in FILES} == set(ORDER), 'give each module its place in ORDER'
+def test_every_folder_is_a_room():
+    folders = {path.name for path in FOLDER.iterdir() if path.is_dir() and path.name != '__pycache__'}
+    assert folders - set(ROOMS) == set(), 'give each room its place in ROOMS'
 
 
 @pytest.mark.parametrize('file', FILES, ids=lambda file: str(file.relative_to(FOLDER)))
-def test_module_imports_only_what_stands_before_it(file):
-    here = place(file)
-    assert here in ORDER, f'give {here} its place in ORDER'
-    allowed = {here, *ORDER[:ORDER.index(here)]}
-    assert own_places(imported(file)) - allowed == set()
+def test_a_room_imports_only_from_those_before_it(file):
+    here = room(file)
+    if here:
+        assert rooms_of(imported(file)) - {*ROOMS[:ROOMS.index(here)], here} == set()
 
 
 @pytest.mark.parametrize('name', ONLY)
 def test_only_its_owner_imports(name):
-    importers = {place(file) for file in FILES
+    importers = {file.relative_to(FOLDER) for file in FILES
                  if any(one == name or one.startswith(f'{name}.') for one in imported(file))}
-    assert importers - ONLY[name] == set()
+    strangers = {file for file in importers if not {file.as_posix(), file.parts[0]} & set(ONLY[name])}
+    assert strangers == set()
+
+
+def test_a_search_never_sees_a_trial():
+    for file in (FOLDER / 'search').glob('*.py'):
+        assert f'{PACKAGE}.model.trial' not in imported(file)
+
 
 #: What takes long to load; then commands, and what of that each needs.
 SLOW = {'matplotlib', 'numba', 'pybullet', 'rclpy', 'scipy'}

@@ -23,7 +23,7 @@ from dlo_calibration import (
     SimulationError,
     Trial,
 )
-from dlo_calibration.parameters import BY_NAME
+from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.search import RandomSearch, SEARCHES
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}

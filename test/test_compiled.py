@@ -17,9 +17,9 @@ from dlo_calibration.compiled import CompiledRope, CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.contact import SelfContact
 from dlo_calibration.layout import Layout
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.session import read_session, session_trials
-from dlo_calibration.trial import Trial
 
 SAMPLES = Path(__file__).parents[1] / 'msg_samples'
 STEP = 0.004

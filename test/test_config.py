@@ -11,7 +11,7 @@ import pytest
 
 from dlo_calibration import InputError
 from dlo_calibration.config import declarations, FIXED_VALUES, Options
-from dlo_calibration.parameters import PARAMETERS
+from dlo_calibration.model.parameters import PARAMETERS
 from dlo_calibration.search import SEARCHES
 
 DECLARED = {declaration.name: declaration for declaration in declarations()}

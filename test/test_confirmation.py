@@ -16,9 +16,9 @@ from dlo_calibration.config import Options
 from dlo_calibration.confirmation import disagreements
 from dlo_calibration.description import read_result, write_result
 from dlo_calibration.messages import bag_types
-from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.score import PointErrors, residuals, trial_score
 from dlo_calibration.report import Origin, write_report
-from dlo_calibration.score import PointErrors, residuals, trial_score
 from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.terminal import error_facts
 from dlo_calibration.worker import calibrate_with

@@ -14,7 +14,6 @@ import pytest
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration.calibration import calibrate
-from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.description import (
     Description,
@@ -25,7 +24,8 @@ from dlo_calibration.description import (
 )
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation import Evaluator
-from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search.random import RandomSearch
 
 OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})

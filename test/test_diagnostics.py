@@ -10,14 +10,14 @@ import pytest
 from wire import wire
 
 from dlo_calibration import diagnostics
-from dlo_calibration.action import Action, Hand
 from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
-from dlo_calibration.chain import Chain
 from dlo_calibration.evaluation import Evaluation
 from dlo_calibration.gain import Gain
-from dlo_calibration.parameters import ParameterSpace
-from dlo_calibration.score import PointErrors
-from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.trial import Goal, Trial
 
 STAMP = 12_500_000_000
 

@@ -61,10 +61,10 @@ def test_the_rope_of_the_readme_runs(tmp_path):
 
     from dlo_calibration.bullet import BulletRope, BulletSimulator
     from dlo_calibration.calibration import calibrate
-    from dlo_calibration.chain import Chain
     from dlo_calibration.config import Options
     from dlo_calibration.description import read_result, write_result
-    from dlo_calibration.parameters import ParameterSpace
+    from dlo_calibration.model.chain import Chain
+    from dlo_calibration.model.parameters import ParameterSpace
     from dlo_calibration.search import LeastSquares
     from dlo_calibration.session import read_session, session_trials
 

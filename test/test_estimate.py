@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from resting import hung, LENGTH, observed, trial_of
 
-from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.estimate import estimate
-from dlo_calibration.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.session import read_session, session_trials
-from dlo_calibration.trial import Goal, Trial
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get('DLO_DATA', ROOT / '../shared/data'))

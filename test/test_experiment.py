@@ -26,9 +26,9 @@ from dlo_calibration.experiment import (
     Task,
     tasks,
 )
-from dlo_calibration.parameters import BY_NAME
+from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.trial import Trial
 from dlo_calibration.worker import hints
 
 OPTIONS = Options.of({'evaluations': 40})

@@ -13,11 +13,11 @@ from toy_simulator import toy_trial, ToySimulator
 from wire import wire
 
 from dlo_calibration.calibration import calibrate
-from dlo_calibration.chain import Chain
 from dlo_calibration.markers import error_colour, markers, MOST_POINTS
-from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.trial import Goal, INSTANTS
 from dlo_calibration.search import RandomSearch
-from dlo_calibration.trial import Goal, INSTANTS
 
 STAMP = 12_500_000_000
 ADD, DELETE_ALL = 0, 3

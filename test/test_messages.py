@@ -14,9 +14,9 @@ import pytest
 from wire import SOURCES, wire
 
 from dlo_calibration import messages
-from dlo_calibration.chain import Chain
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import ACTION, ActionMessage, GOAL, INITIAL, read
+from dlo_calibration.model.chain import Chain
 
 STAMP = 12_500_000_000
 SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from resting import trial_of
 
-from dlo_calibration.chain import Chain
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.noise import noise, noise_of, places_along, smooth
 
 MILLIMETRE = 1e-3

@@ -13,10 +13,10 @@ from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.animation import densely, MOST_FRAMES, simulated_motion, write_animation
+from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture
 from dlo_calibration.rollout import roll_out, Settling
 from dlo_calibration.simulator import Rollout
-from dlo_calibration.trial import shown_goals, Trial
 
 
 def chains_of(trial, shift=0.0):

@@ -17,12 +17,12 @@ from toy_messages import toy_trials
 from toy_simulator import ToySimulator
 
 from dlo_calibration import cli
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.description import read_description, read_result
 from dlo_calibration.errors import InputError
-from dlo_calibration.named_actions import (
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.named_actions import (
     Drag,
     GraspAndPlace,
     LiftAndHold,

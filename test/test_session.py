@@ -23,7 +23,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
 
-from dlo_calibration.chain import Chain
 from dlo_calibration.config import Options
 from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
@@ -38,6 +37,7 @@ from dlo_calibration.messages import (
     INPUT_TYPES,
     read,
 )
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.session import encode, read_session, RecordingError, session_trials, SessionWriter
 
 TYPES = bag_types()

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Chain
 from dlo_calibration.collector import TrialCollector
 from dlo_calibration.config import Options
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, session_trials
-from dlo_calibration.trial import Goal, Trial
 from dlo_calibration.trial_messages import trial_messages
 
 SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'

@@ -11,7 +11,7 @@ from test_rod import CABLE, crumpled, NONE, straight
 
 from dlo_calibration import kernels
 from dlo_calibration.compiled import CompiledRope
-from dlo_calibration.parameters import ParameterSpace
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.twist import ANGLE, FIRST, LAST, spans_between, STIFFNESS, twist_forces
 

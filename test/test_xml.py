@@ -13,9 +13,9 @@ from lxml import etree
 import numpy as np
 import pytest
 
-from dlo_calibration.chain import Chain
 from dlo_calibration.errors import InputError
-from dlo_calibration.named_actions import LiftAndHold
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.named_actions import LiftAndHold
 from dlo_calibration.request import GoalRequest, Request, request_of, TrialRequest
 from dlo_calibration.xml import MAXIMUM_ELEMENTS, MAXIMUM_SIZE, parse, text_of
 

@@ -9,8 +9,8 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 

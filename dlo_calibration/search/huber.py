@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 
 MEDIAN_OF_NORMAL = 0.6745  # median of |x| for a standard normal x
 EFFICIENT = 1.345  # standard deviations where Huber's loss keeps 95 % of the efficiency of least squares

@@ -11,7 +11,7 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, Fit, NEAR
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.search.plan import Plan, PlannedSearch

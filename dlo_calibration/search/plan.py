@@ -9,7 +9,7 @@ from typing import Generator, Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Observation
 
 #: Yields (m, d) points, is sent their m observations, and returns why it finished, in words.

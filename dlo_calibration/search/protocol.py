@@ -11,7 +11,7 @@ from typing import Protocol, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Floats, frozen_array
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
 #: Points asked at a time: enough to keep 1, 2, 4, ... 32 processes busy to the end, few enough that it is

@@ -10,7 +10,7 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation

@@ -14,9 +14,9 @@ from typing import Mapping, Sequence
 import numpy as np
 
 from dlo_calibration import Action, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError, Trial
-from dlo_calibration.chain import Floats
 from dlo_calibration.evaluation import mean_length
-from dlo_calibration.parameters import BY_NAME
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import BY_NAME
 
 REACH = 0.2  # m that a parameter moves the points that it moves most, from 0 to 100
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import numpy as np
 from toy_messages import MINUTE, SECOND, toy_trials, trial_messages
 
-from dlo_calibration.chain import Chain
 from dlo_calibration.messages import (
     ACTION,
     action_trajectory,
@@ -27,6 +26,7 @@ from dlo_calibration.messages import (
     MessageTypes,
     UINT8,
 )
+from dlo_calibration.model.chain import Chain
 from dlo_calibration.session import encode
 
 INT16, INT32 = 3, 5  # sensor_msgs/PointField

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.score import (
+from dlo_calibration.model.score import (
     difference_score,
     feature_points,
     focal_point,

@@ -23,9 +23,9 @@ from typing import ClassVar, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Chain, Floats
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain, Floats
 
 Numbers = tuple[float, ...]
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_calibration.chain import Floats, frozen_array
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats, frozen_array
 
 MAXIMUM_HANDS = 8
 MINIMUM_NORM, MAXIMUM_NORM = 0.5, 1000.0  # of a quaternion, which need not be normalised, but must be finite

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dlo_calibration.action import Action, Hand
-from dlo_calibration.chain import Chain, Floats, frozen_array
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 
 INSTANTS = 5  # goals shown at most where a trial has many
 

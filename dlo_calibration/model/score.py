@@ -11,8 +11,8 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
-from dlo_calibration.trial import Goal, Trial
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Goal, Trial
 
 SIMILAR = 100.0  # below: similar, by the paper's judges
 VERY_SIMILAR = 50.0

@@ -18,8 +18,8 @@ from typing import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.chain import Floats
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats
 
 SCALE = 100.0
 GRAVITY = 9.81  # m/s^2

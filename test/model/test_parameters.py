@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import pytest
 
 from dlo_calibration import InputError, PARAMETERS, ParameterSpace
-from dlo_calibration.parameters import BY_NAME
+from dlo_calibration.model.parameters import BY_NAME
 
 PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
 WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known
@@ -172,7 +172,7 @@ def test_the_mass_that_is_simulated_is_the_calibrated_or_fixed_one():
 def test_adding_a_parameter_is_one_entry():
     """A new line of the table is an option, can be calibrated, and reaches the engines."""
     program = """
-from dlo_calibration import parameters
+from dlo_calibration.model import parameters
 new = parameters.Parameter('stickiness', 'glue', 'N', 1.0, 100.0, 50.0, 'how it sticks')
 parameters.PARAMETERS += (new,)
 parameters.BY_NAME = {parameter.name: parameter for parameter in parameters.PARAMETERS}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Chain, InputError
-from dlo_calibration.chain import bezier_curve, interpolation_matrix
+from dlo_calibration.model.chain import bezier_curve, interpolation_matrix
 
 LINE = np.array([[0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
 
