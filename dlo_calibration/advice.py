@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.excitation import excites
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.observation.excitation import excites
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 

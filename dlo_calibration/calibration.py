@@ -23,7 +23,7 @@ from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.noise import NO_NOISE, noise, smooth
+from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.simulator import Simulator

@@ -21,11 +21,11 @@ import numpy as np
 
 from dlo_calibration.advice import sensitivity
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.excitation import excites, priors
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
-from dlo_calibration.noise import noise
+from dlo_calibration.observation.excitation import excites, priors
+from dlo_calibration.observation.noise import noise
 from dlo_calibration.simulator import Simulator
 from dlo_calibration.uncertainty import UNKNOWN_STD
 

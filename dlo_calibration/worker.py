@@ -120,7 +120,7 @@ def fitted_with(trials: Sequence[Trial], options: Options, simulator: Simulator,
 
 def hints(trials: Sequence[Trial], options: Options) -> Hints:
     """Return what the observed chains alone say, for the search."""
-    from dlo_calibration.excitation import priors  # which loads half of SciPy
+    from dlo_calibration.observation.excitation import priors  # which loads half of SciPy
 
     known = priors(trials, options.space, options.table_height if options.table else None)
     rows = tuple(int(count) for count in known.rows)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from resting import hung, LENGTH, observed
 
-from dlo_calibration.suspension import balance, hanging_parts, Part
+from dlo_calibration.observation.hanging import balance, hanging_parts, Part
 
 MASS = 0.03
 WEIGHT = MASS * 9.81 / LENGTH

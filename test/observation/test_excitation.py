@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from resting import LENGTH, trial_of
 
-from dlo_calibration.excitation import excites, priors
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.observation.excitation import excites, priors
 
 ALL = ParameterSpace(free=tuple(BY_NAME))
 

@@ -8,7 +8,7 @@ import pytest
 from resting import trial_of
 
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.noise import noise, noise_of, places_along, smooth
+from dlo_calibration.observation.noise import noise, noise_of, places_along, smooth
 
 MILLIMETRE = 1e-3
 

@@ -11,12 +11,12 @@ from typing import Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.layout import RESTING_BAND, resting_level
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, MINIMUM_SPACING
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, measured, ParameterSpace, SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.noise import noise, smooth
-from dlo_calibration.suspension import Balance, balance, hanging_parts
+from dlo_calibration.observation.hanging import Balance, balance, hanging_parts
+from dlo_calibration.observation.noise import noise, smooth
+from dlo_calibration.observation.table import RESTING_BAND, resting_level
 
 SIGMAS = 3.0  # of noise that a range leaves room for
 STIFFNESS_MARGIN = 2.0  # factor, either way, for natural curvature, twist and all that is left out

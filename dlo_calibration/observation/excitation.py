@@ -11,11 +11,11 @@ from typing import Mapping, NamedTuple, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.estimate import estimate
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.noise import noise
+from dlo_calibration.observation.estimate import estimate
+from dlo_calibration.observation.noise import noise
 
 CLEAR = 0.1  # m above the table, and the length of the hands' paths: surely not touched
 NEAR = 1.5  # largest diameters: parts that stay further apart surely do not touch
