@@ -21,12 +21,12 @@ from figures import SAMPLES, table, write
 import numpy as np
 
 from dlo_calibration import ParameterSpace, SimulationError, Trial
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.session import read_session, session_trials
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
+from dlo_calibration.simulation.protocol import Simulator
 
 OBJECTS = tuple(f'object{k}' for k in range(1, 6))
 RANDOM = ('flexibility', 'elasticity', 'friction', 'damping')

@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.model.parameters import PARAMETERS
 from dlo_calibration.model.score import PointErrors, residuals
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data')) / 'reference'

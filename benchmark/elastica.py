@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.optimize import least_squares
 
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.evaluation import Evaluator
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data'))

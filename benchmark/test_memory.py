@@ -30,9 +30,9 @@ def resident():
 def memory(name, rounds):
     """Return rounds done and kB at each look, of rounds with random parameters."""
     if name == 'compiled':
-        from dlo_calibration.compiled import CompiledSimulator as Engine
+        from dlo_calibration.simulation.compiled import CompiledSimulator as Engine
     else:
-        from dlo_calibration.bullet import BulletSimulator as Engine
+        from dlo_calibration.simulation.bullet import BulletSimulator as Engine
     session = read_session(SAMPLES / 'object1')
     options = Options.of(session.options)
     trials, _ = session_trials(session, options)

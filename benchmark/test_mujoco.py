@@ -12,9 +12,9 @@ import pytest
 from scipy.integrate import solve_bvp
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.model.parameters import GRAVITY, PARAMETERS
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 mujoco = pytest.importorskip('mujoco', reason='needs MuJoCo: the extra "bench" of setup.py has it')
 

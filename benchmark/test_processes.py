@@ -14,12 +14,12 @@ from figures import HERE, SAMPLES, side_by_side, table, write
 import pytest
 
 from dlo_calibration import calibrate
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import ENGINES, Options
 from dlo_calibration.pool import cores, ProcessExecutor
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 ROUNDS = 3
 EVALUATIONS = 150

@@ -9,11 +9,11 @@ from figures import SAMPLES, side_by_side, table, write
 import numpy as np
 import pytest
 
-from dlo_calibration import kernels
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 NODES = (12, 30, 60, 120)
 ROUNDS = 7

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.parameters import Parameter, PARAMETERS, ParameterSpace
     from dlo_calibration.model.trial import Goal, Trial
-    from dlo_calibration.simulator import Rollout, Simulator
+    from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 __all__ = [
     'PARAMETERS', 'Action', 'CalibrationResult', 'Chain', 'DloCalibrationError', 'Evaluation', 'Goal',
@@ -31,7 +31,7 @@ _HOMES = {
     'model.action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult'),
     'model.chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
     'evaluation': ('Evaluation',),
-    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulator': ('Rollout', 'Simulator'),
+    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulation.protocol': ('Rollout', 'Simulator'),
     'model.trial': ('Goal', 'Trial'),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

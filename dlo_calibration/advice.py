@@ -26,7 +26,7 @@ from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 
 SMALLEST_STEP, LARGEST_STEP = 0.03, 0.25  # in the unit cube: as far as the parameter is unknown, within these

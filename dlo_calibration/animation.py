@@ -23,7 +23,7 @@ from dlo_calibration.picture import (
     unwritable,
     View,
 )
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 
 FRAME_RATE = 10  # 1/s; GIF counts time in 0.01 s
 MOST_FRAMES = 120  # of the motion; a longer one is shown faster

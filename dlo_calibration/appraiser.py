@@ -28,7 +28,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.pool import ProcessExecutor
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.worker import SimulatorFactory
 
 LOOK = 0.05  # s between two looks at whether to stop

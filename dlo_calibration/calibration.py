@@ -26,7 +26,7 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.search.huber import Huber
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spread_of_best, Uncertainty
 from dlo_calibration.unexplained import Explanation, explanations
 

@@ -25,7 +25,7 @@ from dlo_calibration.model.parameters import (
     SCALE,
 )
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP
+from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 
 AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
 CONFIRMING = 'bullet'

@@ -11,7 +11,7 @@ from typing import Any, Callable, Mapping
 
 from dlo_calibration.config import AUTO, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 
 INSTALL = 'pip install numba, or apt install python3-numba'
 SLOWER = 'rounds are simulated by PyBullet, about 30 times slower, because'
@@ -19,7 +19,7 @@ LOG = logging.getLogger('dlo_calibration.engines')
 
 
 def _bullet(options: Options) -> Simulator:
-    from dlo_calibration.bullet import BulletSimulator
+    from dlo_calibration.simulation.bullet import BulletSimulator
 
     return BulletSimulator(**_settings(options), scene=options.scene)
 
@@ -29,7 +29,7 @@ def _compiled(options: Options) -> Simulator:
         raise InputError('engine compiled', f'scene {options.scene}', 'no scene, for it knows only a table',
                          'use engine bullet or auto')
     try:
-        from dlo_calibration.compiled import CompiledSimulator
+        from dlo_calibration.simulation.compiled import CompiledSimulator
     except ImportError as error:
         raise InputError('engine compiled', f'a Python where {_lacks(error)}', 'an installed numba',
                          f'{INSTALL}; or use engine bullet or auto') from error
@@ -42,7 +42,7 @@ def _auto(options: Options) -> Simulator:
         _tell(f'{SLOWER} engine compiled knows no scene: {options.scene}')
         return _bullet(options)
     try:
-        import dlo_calibration.compiled  # noqa: F401  only to see whether it can be
+        import dlo_calibration.simulation.compiled  # noqa: F401  only to see whether it can be
     except ImportError as error:
         _tell(f'{SLOWER} {_lacks(error)}: {INSTALL}')
         return _bullet(options)

@@ -26,7 +26,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Search
-from dlo_calibration.simulator import Rollout, Simulator
+from dlo_calibration.simulation.protocol import Rollout, Simulator
 from dlo_calibration.uncertainty import matters_below
 
 

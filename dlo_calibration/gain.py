@@ -26,7 +26,7 @@ from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites, priors
 from dlo_calibration.observation.noise import noise
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.uncertainty import UNKNOWN_STD
 
 NEW = 0.6  # share of the standard deviation that is left, at most, where a trial tells something: a repeat of

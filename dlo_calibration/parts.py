@@ -20,7 +20,7 @@ from dlo_calibration.model.chain import frozen_array
 from dlo_calibration.model.parameters import MOST_PARTS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares, Search
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 
 FIRST_SHARE = 0.4  # of the budget, that may go into the DLO that is even
 FEWEST_LEFT = 3  # evaluations for each parameter, without which no more parts are tried

@@ -12,7 +12,7 @@ from dlo_calibration.animation import simulated_motion, write_animation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.picture import trial_picture, unwritable
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 
 
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,

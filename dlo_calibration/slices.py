@@ -17,7 +17,7 @@ from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.evaluation import Evaluation, Evaluator
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 
 SECONDS, SHARE, MOST_SECONDS = 5.0, 0.2, 60.0  # that slices may take; what is not there by then is left out
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first

@@ -27,7 +27,7 @@ from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, SEARCHES
-from dlo_calibration.simulator import Simulator
+from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.slices import cut, Slices
 from dlo_calibration.uncertainty import good_count
 

@@ -59,7 +59,6 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     """Execute the three lines of README on a result that was fitted and written."""
     import pybullet
 
-    from dlo_calibration.bullet import BulletRope, BulletSimulator
     from dlo_calibration.calibration import calibrate
     from dlo_calibration.config import Options
     from dlo_calibration.description import read_result, write_result
@@ -67,6 +66,7 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     from dlo_calibration.model.parameters import ParameterSpace
     from dlo_calibration.search import LeastSquares
     from dlo_calibration.session import read_session, session_trials
+    from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
 
     session = read_session(ROOT / 'msg_samples/object1')
     trials, _ = session_trials(session, Options.of(session.options))

@@ -9,17 +9,17 @@ import sys
 import pytest
 
 from dlo_calibration import engines
-from dlo_calibration.bullet import BulletSimulator
 from dlo_calibration.config import ENGINES as NAMES
 from dlo_calibration.config import Options
 from dlo_calibration.engines import ENGINES, make_simulator
 from dlo_calibration.errors import InputError
+from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.worker import calibrate_with
 
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')
-COMPILED = 'dlo_calibration.compiled'
-KERNELS = 'dlo_calibration.kernels'
+COMPILED = 'dlo_calibration.simulation.compiled'
+KERNELS = 'dlo_calibration.simulation.kernels'
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def without_numba(monkeypatch):
     monkeypatch.setitem(sys.modules, 'numba', None)
     for name in (COMPILED, KERNELS):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.delattr('dlo_calibration.kernels', raising=False)  # where it was imported before
+    monkeypatch.delattr('dlo_calibration.simulation.kernels', raising=False)  # where it was imported before
 
 
 @pytest.fixture

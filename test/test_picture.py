@@ -15,8 +15,8 @@ from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.animation import densely, MOST_FRAMES, simulated_motion, write_animation
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture
-from dlo_calibration.rollout import roll_out, Settling
-from dlo_calibration.simulator import Rollout
+from dlo_calibration.simulation.protocol import Rollout
+from dlo_calibration.simulation.rollout import roll_out, Settling
 
 
 def chains_of(trial, shift=0.0):
@@ -152,7 +152,7 @@ def test_instants_between_change_nothing_of_the_course(held_by):
                 if path is not None:
                     path[k] = self._points
 
-    from dlo_calibration.layout import Layout
+    from dlo_calibration.simulation.nodes import Layout
     trial, = toy_trials(1)
     trial = replace(trial, goals=(replace(trial.goals[0], held_by=held_by),))
     courses = []

@@ -16,12 +16,12 @@ from ruamel.yaml import YAML
 from wire import wire
 
 from dlo_calibration import calibrate, cli, ParameterSpace
-from dlo_calibration.bullet import BulletSimulator
 from dlo_calibration.collector import TrialCollector
 from dlo_calibration.config import Options
 from dlo_calibration.messages import ACTION, INPUT_TYPES, read
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.session import read_session
+from dlo_calibration.simulation.bullet import BulletSimulator
 
 SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'
 DOCUMENTS = ('README.md', 'make_yaml.py', 'make_xml.py')

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from dlo_calibration.bullet import BulletSimulator
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
@@ -26,6 +25,7 @@ from dlo_calibration.model.named_actions import (
 )
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.bullet import BulletSimulator
 
 #: Points apart by 0.1 m, the last one by 0.4 m.
 CHAIN = Chain([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0], [0.4, 0, 0], [0.8, 0, 0]])

@@ -8,7 +8,7 @@ import numpy as np
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.simulation.rod import Rod, RodProperties
 
 LENGTH = 0.6
 GRAVITY = np.array([0.0, 0.0, -9.81])

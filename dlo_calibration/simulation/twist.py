@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.natural import frame_along, HAIRPIN
+from dlo_calibration.simulation.natural import frame_along, HAIRPIN
 
 #: columns of a span: its first and last segment, torque per angle [N m], angle, whether it has begun;
 #: then tangent and direction when it began, of the first segment and of the last

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import SimulationError
-from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.simulation.rod import Rod, RodProperties
 
 GRAVITY = np.array([0, 0, -9.81])
 NONE = np.zeros(3)

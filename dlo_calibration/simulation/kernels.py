@@ -18,7 +18,10 @@ from typing import Any, Callable, TypeVar
 import numba
 import numpy as np
 
-from dlo_calibration.contact import (
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation.natural import HAIRPIN, ROUNDED
+from dlo_calibration.simulation.rod import HELD
+from dlo_calibration.simulation.self_contact import (
     FASTEST_PUSH_OUT,
     ITERATIONS,
     PUSH_OUT,
@@ -27,10 +30,7 @@ from dlo_calibration.contact import (
     UNSUPPORTED,
     WEDGED,
 )
-from dlo_calibration.model.chain import Floats
-from dlo_calibration.natural import HAIRPIN, ROUNDED
-from dlo_calibration.rod import HELD
-from dlo_calibration.twist import ANGLE, BEGUN, COLUMNS, END, FIRST, LAST, START, STIFFNESS
+from dlo_calibration.simulation.twist import ANGLE, BEGUN, COLUMNS, END, FIRST, LAST, START, STIFFNESS
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
 

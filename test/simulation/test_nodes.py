@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
-from dlo_calibration.layout import feature_shares, Layout, spread_places
 from dlo_calibration.observation.table import rest_on, resting_level
+from dlo_calibration.simulation.nodes import feature_shares, Layout, spread_places
 
 
 def arc(count=21, height=0.0):

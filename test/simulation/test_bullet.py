@@ -14,7 +14,7 @@ import pybullet
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
-from dlo_calibration.bullet import BulletRope, BulletSimulator
+from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
 
 GRAVITY = 9.81
 STIFF = {'flexibility': 1e-3, 'elasticity': 1e4, 'friction': 0.4, 'self_collision': 0.005, 'mass': 0.05,

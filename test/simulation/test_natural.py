@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_rod import crumpled, energy, FREE, NONE, straight
 
-from dlo_calibration.natural import natural_forces
-from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.simulation.natural import natural_forces
+from dlo_calibration.simulation.rod import Rod, RodProperties
 
 
 def coiled(curvature, **rest):

@@ -15,16 +15,16 @@ from typing import Any, Mapping
 
 import numpy as np
 
-from dlo_calibration import kernels
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.layout import Layout
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import rest_on, resting_level
-from dlo_calibration.rod import Rod, RodProperties
-from dlo_calibration.rollout import roll_out, Settling
-from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
+from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.rollout import roll_out, Settling
 
 NO_PATH = np.empty((0, 0, 3))
 NOWHERE = -1e6  # m: where there is no table

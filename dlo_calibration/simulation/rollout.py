@@ -20,11 +20,11 @@ from typing import Protocol, Sequence
 
 import numpy as np
 
-from dlo_calibration.layout import Layout
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulator import Rollout
+from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.protocol import Rollout
 
 CHECKS = 5  # of the displacement within one stable_time
 ROUNDING = 1e-9  # s

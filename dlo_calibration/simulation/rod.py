@@ -38,8 +38,8 @@ from scipy.linalg import lapack
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import PART_NAMES
-from dlo_calibration.natural import natural_forces
-from dlo_calibration.twist import COLUMNS, spans_between, twist_forces
+from dlo_calibration.simulation.natural import natural_forces
+from dlo_calibration.simulation.twist import COLUMNS, spans_between, twist_forces
 
 Indices = NDArray[np.intp]
 

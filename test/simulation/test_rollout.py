@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.layout import Layout
-from dlo_calibration.rollout import roll_out, Settling
+from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.rollout import roll_out, Settling
 
 STEP = 0.01
 POINTS = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)

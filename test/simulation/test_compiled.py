@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from test_rod import crumpled, GRAVITY, straight
 
-from dlo_calibration import Chain, kernels, PARAMETERS, ParameterSpace, SimulationError
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration import Chain, PARAMETERS, ParameterSpace, SimulationError
 from dlo_calibration.config import Options
-from dlo_calibration.contact import SelfContact
-from dlo_calibration.layout import Layout
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.rod import Rod, RodProperties
 from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.self_contact import SelfContact
 
-SAMPLES = Path(__file__).parents[1] / 'msg_samples'
+SAMPLES = Path(__file__).parents[2] / 'msg_samples'
 STEP = 0.004
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.scene import read_scene
+from dlo_calibration.simulation.obstacles import read_scene
 
 BOX = '<collision><origin xyz="1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 B = '<link name="b"/>'

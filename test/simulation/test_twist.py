@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_rod import CABLE, crumpled, NONE, straight
 
-from dlo_calibration import kernels
-from dlo_calibration.compiled import CompiledRope
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.rod import Rod, RodProperties
-from dlo_calibration.twist import ANGLE, FIRST, LAST, spans_between, STIFFNESS, twist_forces
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.twist import ANGLE, FIRST, LAST, spans_between, STIFFNESS, twist_forces
 
 
 def clamped(count, stiffness=2.0):

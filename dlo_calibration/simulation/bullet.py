@@ -19,16 +19,16 @@ from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.contact import SelfContact
-from dlo_calibration.layout import feature_shares, Layout, spread_places
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import rest_on, resting_level
-from dlo_calibration.rod import Rod, RodProperties
-from dlo_calibration.rollout import roll_out, Settling
-from dlo_calibration.scene import Obstacle, read_scene, unusable
-from dlo_calibration.simulator import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
+from dlo_calibration.simulation.nodes import feature_shares, Layout, spread_places
+from dlo_calibration.simulation.obstacles import Obstacle, read_scene, unusable
+from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
+from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.rollout import roll_out, Settling
+from dlo_calibration.simulation.self_contact import SelfContact
 
 
 @contextmanager

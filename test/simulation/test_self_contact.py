@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from dlo_calibration.contact import SelfContact
-from dlo_calibration.rod import Rod, RodProperties
+from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.self_contact import SelfContact
 
 STEP = 0.004
 RADIUS = 0.005

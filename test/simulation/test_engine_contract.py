@@ -15,8 +15,8 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
 from dlo_calibration import Action, Chain, Goal, Hand, PARAMETERS, ParameterSpace, SimulationError, Trial
-from dlo_calibration.bullet import BulletSimulator
-from dlo_calibration.compiled import CompiledSimulator
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 #: Each takes what `BulletSimulator` takes, but a scene.
 FACTORIES = (BulletSimulator, CompiledSimulator)
@@ -254,7 +254,7 @@ def test_a_repeat_is_bit_exact_in_another_process(make):
             'from test_engine_contract import *\n'
             'make = next(factory for factory in FACTORIES if factory.name == sys.argv[3])\n'
             'print(digest(rollout(make(**{"nodes": NODES, "time_step": TIME_STEP, **SMALL}))))')
-    tests = Path(__file__).parents[1]
+    tests = Path(__file__).parents[2]
     folders = [str(tests / name) for name in ('simulation', 'support')]
     printed = subprocess.run([sys.executable, '-c', code, *folders, here.name],
                              capture_output=True, text=True, check=True).stdout
