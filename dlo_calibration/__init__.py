@@ -28,10 +28,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    'model.action': ('Action', 'Hand'), 'calibration': ('calibrate', 'CalibrationResult'),
-    'model.chain': ('Chain',), 'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
+    'model.action': ('Action', 'Hand'),
+    'calibration': ('calibrate', 'CalibrationResult'),
+    'model.chain': ('Chain',),
+    'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
     'evaluation': ('Evaluation',),
-    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'), 'simulation.protocol': ('Rollout', 'Simulator'),
+    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'),
+    'simulation.protocol': ('Rollout', 'Simulator'),
     'model.trial': ('Goal', 'Trial'),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
