@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dlo_calibration.advice import Advice, advise
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, Limits, mean_length
+from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, mean_length
 from dlo_calibration.examination import Examination, examine
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
@@ -224,12 +224,11 @@ def _searched(evaluate: Everywhere, search: Search, budget: int,
     best: Evaluation | None = None
     stopped = False
     while len(kept) < budget and not stopped:
-        limits = Limits.of(search, kept, budget)  # known before it is asked: the same for any executor
         points = search.ask(budget - len(kept))
         if not len(points):
             break
         batch: list[Evaluation] = []
-        for evaluation in evaluate(points, len(kept), limits):
+        for evaluation in evaluate(points, len(kept)):
             batch.append(evaluation)
             if on_evaluation is not None:
                 on_evaluation(evaluation)

@@ -47,8 +47,6 @@ def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: E
         'simulations_per_second': simulations_per_second, 'seconds_left': seconds_left}
     if evaluation.failure:
         values['failure'] = evaluation.failure
-    if evaluation.abandoned:
-        values['skipped_trials'] = evaluation.skipped  # the score is a lower bound
     message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {best.score:.1f}, '
                f'{seconds_left:.0f} s left')
     level = WARN if evaluation.failure else OK

@@ -25,9 +25,7 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.search import Search
 from dlo_calibration.simulation.protocol import Rollout, Simulator
-from dlo_calibration.uncertainty import matters_below
 
 
 @dataclass(frozen=True)
@@ -38,13 +36,12 @@ class Evaluation:
     :param index: 0, 1, ... in the order asked.
     :param point: (d,) in the unit cube.
     :param values: free parameters on the 0..100 scale.
-    :param scores: difference score of each trial, NaN of one that was skipped; empty where it failed.
-    :param errors: over all goal points; None where it failed or was abandoned.
+    :param scores: difference score of each trial; empty where it failed.
+    :param errors: over all goal points; None where it failed.
     :param residuals: (m,) [m]; kept for the best evaluation only.
     :param unsettled: names of trials that never came to rest.
     :param failure: why it failed; empty where it did not.
-    :param skipped: number of trials that were not simulated any more: one before
-        them failed, or the evaluation was abandoned, as its score was too high already.
+    :param skipped: number of trials that were not simulated any more, as one before them failed.
     """
 
     index: int
@@ -58,19 +55,8 @@ class Evaluation:
     skipped: int = 0
 
     @property
-    def abandoned(self) -> bool:
-        """Whether trials were skipped because the score was too high already."""
-        return self.skipped > 0 and not self.failure
-
-    @property
     def score(self) -> float:
-        """
-        Average difference score over the trials [cm]; infinite where it failed.
-
-        Where it was abandoned, a lower bound: no score is less than 0.
-        """
-        if self.abandoned:
-            return float(np.mean(np.nan_to_num(self.scores, nan=0.0)))
+        """Average difference score over the trials [cm]; infinite where it failed."""
         return float(np.mean(self.scores)) if self.scores else float('inf')
 
 
@@ -102,64 +88,32 @@ class Evaluator:
         physical = self.space.physical(values, self._length)
         return [self.simulator.simulate(trial, physical) for trial in self.trials]
 
-    def evaluate(self, index: int, point: Floats, should_stop: Callable[[], bool] = lambda: False,
-                 limits: Limits | None = None) -> Evaluation:
+    def evaluate(self, index: int, point: Floats,
+                 should_stop: Callable[[], bool] = lambda: False) -> Evaluation:
         """
         Try a (d,) point of the unit cube on every trial.
 
-        :param limits: None: every trial is simulated, whatever the others gave.
         :raises CancelledError: as soon as `should_stop` says so, between trials.
         """
         point = frozen_array(point)
         evaluation = Evaluation(index, point, self.space.values(point))
         physical = self.space.physical(evaluation.values, self._length)
-        scores = np.full(len(self.trials), np.nan)
-        rollouts: dict[int, Rollout] = {}
-        for k in range(len(self.trials)) if limits is None else limits.order:
+        rollouts: list[Rollout] = []
+        for trial in self.trials:
             if should_stop():
                 raise CancelledError
-            left = len(self.trials) - len(rollouts) - 1
             try:
-                rollouts[k] = self.simulator.simulate(self.trials[k], physical)
+                rollouts.append(self.simulator.simulate(trial, physical))
             except SimulationError as error:
-                return replace(evaluation, failure=str(error), skipped=left)
-            scores[k] = self._scores[k](rollouts[k].chains)
-            evaluation = replace(
-                evaluation, scores=tuple(float(score) for score in scores), skipped=left,
-                unsettled=tuple(trial.name for j, trial in enumerate(self.trials)
-                                if j in rollouts and not all(rollouts[j].settled)))
-            if left and limits is not None and evaluation.score > limits.score:
-                return evaluation
-        residual = np.concatenate([residuals(trial, rollouts[j].chains)
-                                   for j, trial in enumerate(self.trials)])
+                return replace(evaluation, failure=str(error), skipped=len(self.trials) - len(rollouts) - 1)
+        evaluation = replace(
+            evaluation, scores=tuple(float(score(rollout.chains))
+                                     for score, rollout in zip(self._scores, rollouts, strict=True)),
+            unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
+                            if not all(rollout.settled)))
+        residual = np.concatenate([residuals(trial, rollout.chains)
+                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
         return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
-
-
-@dataclass(frozen=True)
-class Limits:
-    """
-    When evaluations are abandoned.
-
-    :param score: as soon as the score cannot be this low [cm] any more.
-    :param order: indices of the trials in the order to simulate them.
-    """
-
-    score: float
-    order: tuple[int, ...]
-
-    @classmethod
-    def of(cls, search: Search, evaluations: Sequence[Evaluation], budget: int) -> Limits | None:
-        """
-        Return what neither the search nor the result can tell from no limits; None: nothing is.
-
-        Trials that scored high so far come first, as they decide soonest.
-        """
-        complete = [one for one in evaluations if one.scores and not one.skipped]
-        score = max(search.limit, matters_below([one.score for one in complete], budget))
-        if not np.isfinite(score):
-            return None
-        mean = np.mean([one.scores for one in complete], axis=0)
-        return cls(score, tuple(int(k) for k in np.argsort(-mean, kind='stable')))
 
 
 class Everywhere:
@@ -173,17 +127,17 @@ class Everywhere:
         self._parcel = _Parcel(evaluator)
         self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
 
-    def __call__(self, points: Floats, first: int, limits: Limits | None = None) -> Iterator[Evaluation]:
+    def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
         """Evaluate (k, d) points, the first with the index `first`."""
         if self._executor is None:
             for k, point in enumerate(points):
                 try:
-                    yield self.evaluator.evaluate(first + k, point, self._should_stop, limits)
+                    yield self.evaluator.evaluate(first + k, point, self._should_stop)
                 except CancelledError:
                     return
             return
         futures: list[Future[Evaluation]] = [
-            self._executor.submit(_evaluate_elsewhere, self._key, self._parcel, first + k, point, limits)
+            self._executor.submit(_evaluate_elsewhere, self._key, self._parcel, first + k, point)
             for k, point in enumerate(points)]
         try:
             for future in futures:
@@ -262,7 +216,6 @@ class _Here(threading.local):
 _here = _Here()
 
 
-def _evaluate_elsewhere(key: str, parcel: _Parcel, index: int, point: Floats,
-                        limits: Limits | None) -> Evaluation:
+def _evaluate_elsewhere(key: str, parcel: _Parcel, index: int, point: Floats) -> Evaluation:
     """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
-    return _here.of(key, parcel).evaluate(index, point, limits=limits)
+    return _here.of(key, parcel).evaluate(index, point)

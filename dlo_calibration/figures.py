@@ -39,9 +39,8 @@ def convergence_figure(result: CalibrationResult) -> str:
     """Draw the score of every evaluation, and the best one so far."""
     counts = np.arange(1.0, len(result.evaluations) + 1)
     scores = np.array([one.score for one in result.evaluations])
-    abandoned = np.array([one.abandoned for one in result.evaluations], dtype=bool)
     failed = np.array([bool(one.failure) for one in result.evaluations], dtype=bool)
-    finished = ~abandoned & ~failed
+    finished = ~failed
     best = np.minimum.accumulate(np.where(finished, scores, np.inf))
     chart = Chart(
         'Score of every parameter set that was tried', 'evaluation', 'difference score [cm]',
@@ -49,9 +48,6 @@ def convergence_figure(result: CalibrationResult) -> str:
         logarithmic=True)
     chart.line(counts, best, BLUE, 'best so far')
     chart.marks(counts[finished], scores[finished], MEASURED, 'tried', size=2.5)
-    if abandoned.any():
-        chart.marks(counts[abandoned], scores[abandoned], GREY, shape=TRIANGLE, size=3.5,
-                    label='abandoned early: its score is at least that high')
     if failed.any():
         top = float(scores[finished].max(initial=1.0))
         chart.marks(counts[failed], np.full(failed.sum(), 1.3 * top), RED, shape=CROSS,

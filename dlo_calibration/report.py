@@ -145,8 +145,6 @@ def write_evaluations(path: Path, result: CalibrationResult) -> None:
     """
     Write every evaluation as a row of a CSV file: parameters (0..100), scores [cm], error [m].
 
-    A trial that was skipped has no score; the score of an abandoned evaluation is a lower bound.
-
     :raises InputError: where the file cannot be written.
     """
     names = result.space.free
@@ -155,12 +153,12 @@ def write_evaluations(path: Path, result: CalibrationResult) -> None:
         with path.open('w', newline='', encoding='utf-8') as stream:
             rows = csv.writer(stream)
             rows.writerow(['evaluation', *names, 'score', *(f'score of {name}' for name in trials),
-                           'mean_error_m', 'failure', 'skipped_trials'])
+                           'mean_error_m', 'failure'])
             for one in result.evaluations:
-                scores = ['' if np.isnan(score) else score for score in one.scores] or [''] * len(trials)
+                scores = one.scores or [''] * len(trials)
                 error = '' if one.errors is None else one.errors.mean
                 rows.writerow([one.index + 1, *(one.values[name] for name in names), one.score, *scores,
-                               error, one.failure, one.skipped])
+                               error, one.failure])
     except OSError as error:
         raise _unwritable(path, error) from error
 
@@ -265,7 +263,7 @@ def _surroundings(result: CalibrationResult, slices: Slices | None) -> str:
 
 
 def _search(result: CalibrationResult) -> str:
-    lowest = min(one.score for one in result.evaluations if not one.abandoned)
+    lowest = min(one.score for one in result.evaluations)
     chosen = '' if result.best.score <= lowest else """
         The result is the one whose points are nearest, by the sum of squares, which need not be the one
         with the lowest score."""

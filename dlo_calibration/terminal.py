@@ -129,8 +129,6 @@ def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -
 def error_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return how well the simulated chains fit, and how that was found, in words."""
     errors = result.errors
-    abandoned = sum(evaluation.abandoned for evaluation in result.evaluations)
-    early = f'; {abandoned} evaluations abandoned early' if abandoned else ''
     return [
         ('difference score', f'{result.best.score:.1f} cm (below {SIMILAR:g}: similar, '
                              f'below {VERY_SIMILAR:g}: very similar)'),
@@ -138,7 +136,7 @@ def error_facts(result: CalibrationResult) -> list[tuple[str, str]]:
                        f'({100 * errors.mean / result.length:.2f} % of the length)'),
         ('rms / max error', f'{errors.rms * 1e3:.2f} / {errors.max * 1e3:.2f} mm'),
         ('trials', str(len(result.trials))),
-        ('evaluations', f'{len(result.evaluations)} ({result.simulations} simulations{early}) '
+        ('evaluations', f'{len(result.evaluations)} ({result.simulations} simulations) '
                         f'in {result.seconds:.1f} s'),
         ('search', f'{result.search or "-"}, seed {"-" if result.seed is None else result.seed}'),
         ('engine', result.engine),

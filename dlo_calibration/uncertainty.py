@@ -116,19 +116,6 @@ def good_count(evaluations: int) -> int:
     return max(BEST_MINIMUM, round(BEST_SHARE * evaluations))
 
 
-def matters_below(scores: Sequence[float], budget: int) -> float:
-    """
-    Return the score above which an evaluation cannot change the spread any more.
-
-    :param scores: so far, of evaluations that were simulated completely.
-    :param budget: how many evaluations there will be at most.
-    :returns: infinite where every score still matters.
-    """
-    count = good_count(budget)
-    finite = sorted(score for score in scores if np.isfinite(score))
-    return finite[count - 1] if len(finite) >= 2 * count else float('inf')
-
-
 def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     """
     Return how far the parameters of the best evaluations lie apart.

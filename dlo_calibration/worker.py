@@ -225,7 +225,7 @@ class Progress:
         self.newest = evaluation
         if self.best is None or evaluation.score < self.best.score:
             self.best = evaluation
-        if math.isfinite(evaluation.score) and not evaluation.abandoned:
+        if math.isfinite(evaluation.score):
             insort(self._good, evaluation, key=lambda one: one.score)
             del self._good[good_count(self.evaluations):]
 

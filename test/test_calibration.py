@@ -24,7 +24,7 @@ from dlo_calibration import (
     Trial,
 )
 from dlo_calibration.model.parameters import BY_NAME
-from dlo_calibration.search import RandomSearch, SEARCHES
+from dlo_calibration.search import SEARCHES
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
 TRIALS = (toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=1.0))
@@ -395,47 +395,10 @@ def test_trials_of_unequal_shape_are_compared_each_by_itself():
         assert chains == pytest.approx(ToySimulator().simulate(trial, result.physical()).chains, abs=1e-12)
 
 
-class Patient(RandomSearch):
-    """It wants to know every score."""
-
-    limit = float('inf')
-
-
-@pytest.mark.parametrize('fail_below', [-1.0, 20.0])
-@pytest.mark.parametrize('budget', [150, 400])
-def test_abandoning_evaluations_changes_nothing_but_the_time(budget, fail_below):
-    simulator = ToySimulator(fail_below=fail_below)
-    quick = found(simulator=simulator, budget=budget)
-    whole = calibrate(TRIALS, ParameterSpace(), simulator, Patient(4, 1), budget=budget)
-    assert not any(e.abandoned for e in whole.evaluations)
-    assert any(e.abandoned for e in quick.evaluations)
-    assert quick.parameters == whole.parameters
-    assert quick.best.scores == whole.best.scores
-    assert quick.best.residuals.tobytes() == whole.best.residuals.tobytes()
-    for early, complete in zip(quick.evaluations, whole.evaluations, strict=True):
-        assert early.point.tobytes() == complete.point.tobytes()
-        if early.abandoned:
-            assert quick.best.score < early.score <= complete.score
-            assert early.errors is None
-        else:
-            assert (early.scores, early.failure) == (complete.scores, complete.failure)
-
-
-def test_abandoned_trials_are_not_simulated():
-    simulator = ToySimulator()
-    simulate, done = simulator.simulate, []
-    simulator.simulate = lambda trial, physical: done.append(trial.name) or simulate(trial, physical)
-    result = found(simulator=simulator)
-    examined = 2 * result.examination.evaluations
-    assert result.simulations == len(done) < 0.9 * 300 + examined
-    assert sum(np.isnan(e.scores).sum() for e in result.evaluations if e.scores) == 300 + examined - len(done)
-    assert result.warnings == ()
-
-
 def test_a_failed_evaluation_counts_what_was_simulated():
     result = found(simulator=ToySimulator(fail_below=50.0), budget=8)
     failed = [e for e in result.evaluations if e.failure]
-    assert all(e.skipped == 1 and not e.abandoned for e in failed)
+    assert all(e.skipped == 1 for e in failed)
     assert result.simulations == 16 - len(failed) + 2 * result.examination.evaluations
 
 

@@ -318,20 +318,6 @@ def test_a_process_that_died_is_told_once(run, session, tmp_path):
     assert 'was killed by SIGKILL' in warning
 
 
-def test_evaluations_that_were_abandoned_are_told_in_the_table_and_in_the_file(run, session, tmp_path):
-    code, output, _ = run('fit', session, '--search', 'random', '--evaluations', 100,
-                          '--output', tmp_path / 'out')
-    assert code == 0
-    with (tmp_path / 'out' / 'evaluations.csv').open(encoding='utf-8', newline='') as stream:
-        rows = list(csv.DictReader(stream))
-    skipped = sum(int(row['skipped_trials']) for row in rows)
-    assert skipped > 0
-    assert all((row['skipped_trials'] == '0') == bool(row['mean_error_m']) for row in rows)
-    words = ' '.join(output.split())
-    assert f'; {skipped} evaluations abandoned early)' in words
-    assert int(re.search(r'100 \((\d+) simulations', words)[1]) >= 200 - skipped
-
-
 def test_module_is_the_command(session):
     done = subprocess.run(
         [sys.executable, '-m', 'dlo_calibration', 'info', str(session), '--json'],

@@ -91,17 +91,6 @@ def test_progress_tells_the_best_so_far_and_what_is_left(types):
     assert one.level == types.level(1)
 
 
-def test_progress_tells_what_an_abandoned_evaluation_skipped(types):
-    best = Evaluation(0, np.array([0.25]), {'friction': 25.0}, (12.0, 14.0))
-    abandoned = Evaluation(1, np.array([0.5]), {'friction': 50.0}, (60.0, float('nan')), skipped=1)
-    one, values = by_name(diagnostics.progress(
-        types, stamp=STAMP, evaluation=abandoned, best=best, evaluations=150, simulations_per_second=31.5,
-        seconds_left=4.6))['progress']
-    assert (values['skipped_trials'], values['score'], values['best_score']) == ('1', '30.0', '13.0')
-    assert 'failure' not in values
-    assert one.level == types.level(0)
-
-
 @pytest.mark.parametrize(('state', 'level'), [
     ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
 def test_status_tells_state_trials_and_refusal(types, state, level):

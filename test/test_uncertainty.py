@@ -11,10 +11,8 @@ import pytest
 from dlo_calibration.uncertainty import (
     drawn_again,
     from_jacobian,
-    good_count,
     independence,
     left_out,
-    matters_below,
     optimum_shift,
     predictive_std,
     spread_of_best,
@@ -79,23 +77,6 @@ def test_failed_evaluations_count_as_bad_ones():
     for name in ('std', 'lower', 'upper'):
         assert getattr(with_failed, name).tolist() == getattr(with_bad, name).tolist()
     assert set(spread_of_best(failed + good[:5], best).verdicts) == {'not identifiable'}
-
-
-@pytest.mark.parametrize('budget', [20, 150, 1000])
-def test_what_is_above_the_score_that_matters_can_be_anything(budget):
-    evaluations = tried(budget)
-    scores = [one.score for one in evaluations]
-    best, found = spread(evaluations)
-    limit = matters_below(scores, budget)
-    assert sum(score <= limit for score in scores) == good_count(budget)
-    worse = [Tried(one.point, one.score if one.score <= limit else limit + 1e-9) for one in evaluations]
-    assert spread_of_best(worse, best).std.tolist() == found.std.tolist()
-
-
-def test_every_score_matters_until_there_are_enough():
-    assert matters_below([1.0] * 15, 150) == float('inf')
-    assert matters_below([*[1.0] * 15, float('inf')], 150) == float('inf')
-    assert matters_below([1.0] * 16, 150) == 1.0
 
 
 SHAPES = ((1, 40), (2, 20), (1, 40), (1, 40))

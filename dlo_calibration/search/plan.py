@@ -43,11 +43,6 @@ class PlannedSearch:
             self._wanted = np.asarray(next(self._running), dtype=float)
         return self._wanted[len(self._told):][:limit].copy()
 
-    @property
-    def limit(self) -> float:
-        """Every score and every residual tells the plan something."""
-        return float('inf')
-
     def tell(self, observations: Sequence[Observation]) -> None:
         """Take what the points last asked gave; go on with the plan once all are there."""
         self._told.extend(observations)

@@ -20,10 +20,9 @@ class Observation:
     What one point gave.
 
     :param point: (d,) in the unit cube.
-    :param score: to be minimised; infinite where the simulation failed, and no
-        more than a lower bound where it was abandoned above the search's `limit`.
+    :param score: to be minimised; infinite where the simulation failed.
     :param residuals: (m,) [m] simulated minus observed coordinates of all
-        trials; None where the simulation failed or was abandoned.
+        trials; None where the simulation failed.
     """
 
     point: Floats
@@ -87,14 +86,6 @@ class Search(Protocol):
 
         How many is the method's choice and never depends on the number of
         workers.  No points at all means that it has finished.
-        """
-
-    @property
-    def limit(self) -> float:
-        """
-        Score above which the search does not care how bad a point is; infinite: it always cares.
-
-        Asked before each `ask`; such a point need not be simulated to its end.
         """
 
     def tell(self, observations: Sequence[Observation]) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
-#: Points asked at a time: enough to keep 1, 2, 4, ... 32 processes busy to the end, few enough that it is
-#: soon known which scores matter.
+#: Points asked at a time: enough to keep 1, 2, 4, ... 32 processes busy to the end.
 BATCH = 32
 
 
@@ -36,11 +35,6 @@ class RandomSearch:
     def ask(self, limit: int) -> Floats:
         """Return the next points (m, d) of one random sequence, however it is divided."""
         return self._generator.random((min(limit, BATCH), self._dimension))
-
-    @property
-    def limit(self) -> float:
-        """No score matters to what is asked next."""
-        return 0.0
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Remember the best; what was found changes nothing else."""
