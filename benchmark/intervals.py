@@ -32,7 +32,7 @@ from discretisation import exact_trials  # noqa: E402
 from dlo_calibration import Chain, ParameterSpace, Trial  # noqa: E402
 from dlo_calibration.calibration import calibrate  # noqa: E402
 from dlo_calibration.config import Options  # noqa: E402
-from dlo_calibration.evaluation import Evaluator  # noqa: E402
+from dlo_calibration.evaluation.evaluation import Evaluator  # noqa: E402
 from dlo_calibration.model.parameters import BY_NAME, PAPER_PARAMETERS  # noqa: E402
 from dlo_calibration.search import LeastSquares  # noqa: E402
 from dlo_calibration.simulation.compiled import CompiledSimulator  # noqa: E402

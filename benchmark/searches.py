@@ -21,7 +21,7 @@ import numpy as np
 
 from dlo_calibration.config import Options
 from dlo_calibration.engines import make_simulator
-from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.search import Observation, SEARCHES
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.session import read_session, session_trials

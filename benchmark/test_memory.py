@@ -12,7 +12,7 @@ import pytest
 
 from dlo_calibration import SimulationError
 from dlo_calibration.config import Options
-from dlo_calibration.pool import ProcessExecutor
+from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.session import read_session, session_trials
 
 #: engine -> rounds

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 if TYPE_CHECKING:
     from dlo_calibration.calibration import calibrate, CalibrationResult
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-    from dlo_calibration.evaluation import Evaluation
+    from dlo_calibration.evaluation.evaluation import Evaluation
     from dlo_calibration.model.action import Action, Hand
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.parameters import Parameter, PARAMETERS, ParameterSpace
@@ -32,7 +32,7 @@ _HOMES = {
     'calibration': ('calibrate', 'CalibrationResult'),
     'model.chain': ('Chain',),
     'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
-    'evaluation': ('Evaluation',),
+    'evaluation.evaluation': ('Evaluation',),
     'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'),
     'simulation.protocol': ('Rollout', 'Simulator'),
     'model.trial': ('Goal', 'Trial'),

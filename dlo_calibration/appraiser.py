@@ -22,12 +22,12 @@ from typing import Any, Iterator, Sequence, Union
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.config import Options
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.evaluation import mean_length
+from dlo_calibration.evaluation.evaluation import mean_length
+from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.gain import covers, Gain, glimpse, information, Knowledge, knowledge
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.pool import ProcessExecutor
 from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.worker import SimulatorFactory
 

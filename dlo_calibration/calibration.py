@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dlo_calibration.advice import Advice, advise
 from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.evaluation import Evaluation, Evaluator, Everywhere, mean_length
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere, mean_length
 from dlo_calibration.examination import Examination, examine
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE

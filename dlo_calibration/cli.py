@@ -22,7 +22,7 @@ from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.experiment import Observed
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.recording import SessionWriter

@@ -26,7 +26,7 @@ import numpy as np
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.worker import fitted_with, SimulatorFactory

@@ -18,6 +18,7 @@ from typing import Any, Callable, Iterator, Mapping, Protocol, Sequence, TextIO
 from dlo_calibration import experiment_report as report
 from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import (
     Journal,
     judged_chains,
@@ -30,7 +31,6 @@ from dlo_calibration.experiment import (
 )
 from dlo_calibration.experiment_summary import complete_runs, run_score, summary
 from dlo_calibration.picture import session_picture
-from dlo_calibration.pool import cores, ProcessExecutor
 from dlo_calibration.samples import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.terminal import TaskBar

@@ -15,7 +15,7 @@ import numpy as np
 
 from dlo_calibration.calibration import calibrate, CalibrationResult, examined
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.chain import frozen_array
 from dlo_calibration.model.parameters import MOST_PARTS, ParameterSpace
 from dlo_calibration.model.trial import Trial

@@ -14,7 +14,7 @@ from typing import Callable, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.evaluation import Evaluation, Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
 from dlo_calibration.simulation.protocol import Simulator

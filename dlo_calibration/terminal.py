@@ -14,7 +14,7 @@ from rich.table import Table
 
 from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 
 WIDTH = 110  # columns where the output is not a terminal

@@ -17,12 +17,12 @@ import time
 import traceback
 from typing import Callable, Iterator, Sequence, Union
 
-from dlo_calibration import pool
 from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed, explained
-from dlo_calibration.cluster import ClusterExecutor
 from dlo_calibration.config import AUTO, CONFIRMING, Options
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.evaluation import Evaluation
+from dlo_calibration.evaluation import processes
+from dlo_calibration.evaluation.cluster import ClusterExecutor
+from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.parts import calibrate_parts
@@ -192,12 +192,12 @@ def sliced_with(result: CalibrationResult, options: Options, make_simulator: Sim
 
 
 def _executor(options: Options, on_death: Callable[[str], None],
-              on_wait: Callable[[str], None]) -> pool.ProcessExecutor | ClusterExecutor | None:
+              on_wait: Callable[[str], None]) -> processes.ProcessExecutor | ClusterExecutor | None:
     """Return where evaluations are simulated; None: here."""
     if options.scheduler:
         return ClusterExecutor(options.scheduler, on_death, on_wait)
-    workers = min(options.workers or pool.cores(), options.evaluations)
-    return pool.ProcessExecutor(workers, on_death) if workers > 1 else None
+    workers = min(options.workers or processes.cores(), options.evaluations)
+    return processes.ProcessExecutor(workers, on_death) if workers > 1 else None
 
 
 class Progress:

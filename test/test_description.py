@@ -23,7 +23,7 @@ from dlo_calibration.description import (
     write_result,
 )
 from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search.random import RandomSearch

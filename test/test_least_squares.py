@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.config import Options
-from dlo_calibration.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.session import read_session, session_trials

@@ -17,10 +17,11 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import Deadly, ToySimulator
 
-from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation, pool
+from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation
 from dlo_calibration.config import ENGINES as ENGINE_NAMES
 from dlo_calibration.config import Options
 from dlo_calibration.engines import ENGINES
+from dlo_calibration.evaluation import processes
 from dlo_calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -194,9 +195,9 @@ PROGRAM = """
 import sys, threading, time
 assert __name__ == '__main__', 'the main module was imported by a child'
 sys.modules['heavy'] = sys
-from dlo_calibration import pool
+from dlo_calibration.evaluation import processes
 
-executor = pool.ProcessExecutor(2)
+executor = processes.ProcessExecutor(2)
 print(executor.submit(eval, "'heavy' in __import__('sys').modules").result(), flush=True)
 for _ in range(8):
     executor.submit(time.sleep, 600)
@@ -246,7 +247,7 @@ def test_processes_leave_signals_to_their_parent(parent):
 
 
 def test_closing_a_pool_ends_what_is_under_way():
-    executor = pool.ProcessExecutor(2)
+    executor = processes.ProcessExecutor(2)
     future = executor.submit(time.sleep, 10 * PATIENCE)
     children = spawned(os.getpid(), 1)
     executor.close()
@@ -256,11 +257,11 @@ def test_closing_a_pool_ends_what_is_under_way():
 
 
 def test_zero_workers_are_one_per_core():
-    executor = pool.ProcessExecutor(0)
+    executor = processes.ProcessExecutor(0)
     try:
-        for _ in range(2 * pool.cores()):
+        for _ in range(2 * processes.cores()):
             executor.submit(time.sleep, 10 * PATIENCE)
-        assert len(spawned(os.getpid(), len(os.sched_getaffinity(0)))) == pool.cores()
+        assert len(spawned(os.getpid(), len(os.sched_getaffinity(0)))) == processes.cores()
     finally:
         executor.close()
 

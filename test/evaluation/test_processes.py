@@ -11,7 +11,8 @@ import time
 from processes import children
 import pytest
 
-from dlo_calibration import DloCalibrationError, InputError, pool
+from dlo_calibration import DloCalibrationError, InputError
+from dlo_calibration.evaluation import processes
 
 PATIENCE = 60.0
 
@@ -23,7 +24,7 @@ def told():
 
 @pytest.fixture
 def executor(told):
-    executor = pool.ProcessExecutor(2, told.append)
+    executor = processes.ProcessExecutor(2, told.append)
     yield executor
     executor.close()
 
@@ -110,10 +111,10 @@ def test_what_waits_can_be_cancelled(executor):
 
 
 def test_shutdown_waits_for_what_was_submitted():
-    with pool.ProcessExecutor(2) as executor:
+    with processes.ProcessExecutor(2) as executor:
         futures = [executor.submit(pow, 2, k) for k in range(10)]
     assert [future.result(0) for future in futures] == [2**k for k in range(10)]
 
 
 def test_processes_are_nicer_than_their_parent(executor):
-    assert executor.submit(os.nice, 0).result(PATIENCE) == min(os.nice(0) + pool.NICENESS, 19)
+    assert executor.submit(os.nice, 0).result(PATIENCE) == min(os.nice(0) + processes.NICENESS, 19)

@@ -17,13 +17,14 @@ import pytest
 from toy_messages import toy_trials
 from toy_simulator import Deadly, ToySimulator
 
-from dlo_calibration import cluster, DloCalibrationError, InputError
+from dlo_calibration import DloCalibrationError, InputError
 from dlo_calibration.config import Options
+from dlo_calibration.evaluation import cluster
 from dlo_calibration.worker import calibrate_with
 
 distributed = pytest.importorskip('distributed', reason='the extra "distributed" of setup.py has it')
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0
 PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test'), os.environ.get('PYTHONPATH', '')])
 
