@@ -99,6 +99,11 @@ class CalibrationResult:
         return {name: estimate.value for name, estimate in self.parameters.items()}
 
     @property
+    def std(self) -> Floats:
+        """(d,) standard deviations of the found values, in the unit cube."""
+        return np.array([estimate.std for estimate in self.parameters.values()]) / SCALE
+
+    @property
     def errors(self) -> PointErrors:
         """Point errors of the best evaluation."""
         assert self.best.errors is not None

@@ -20,12 +20,12 @@ from typing import Any, Sequence
 import numpy as np
 
 from dlo_calibration.advice import sensitivity
-from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites, priors
 from dlo_calibration.observation.noise import noise
+from dlo_calibration.outcome import Calibrated
 from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.uncertainty import UNKNOWN_STD
 
@@ -125,7 +125,7 @@ class Gain:
 
 
 def knowledge(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None,
-              result: CalibrationResult | None = None) -> Knowledge:
+              result: Calibrated | None = None) -> Knowledge:
     """
     Return what is known without the trials that `result` does not have.
 
@@ -152,7 +152,7 @@ def knowledge(trials: Sequence[Trial], space: ParameterSpace, table_height: floa
                      float(residual * np.sqrt(ALIKE)))
 
 
-def covers(result: CalibrationResult) -> bool:
+def covers(result: Calibrated) -> bool:
     """Tell whether a result says what is known after its trials."""
     found = result.examination
     return found is not None and found.regular and found.uncertainty.covariance is not None
@@ -195,7 +195,7 @@ def information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator
     return np.asarray(matrix.T @ matrix / known.scale**2)
 
 
-def told_by(result: CalibrationResult) -> Floats:
+def told_by(result: Calibrated) -> Floats:
     """
     Return (T, d) standard deviations in the unit cube: what each trial of a result would tell alone.
 
@@ -214,7 +214,7 @@ def told_by(result: CalibrationResult) -> Floats:
     return np.array(rows)
 
 
-def silent(result: CalibrationResult) -> tuple[str, ...]:
+def silent(result: Calibrated) -> tuple[str, ...]:
     """Return the names of the trials of a result that told nothing at all; none where that is not known."""
     if not covers(result):
         return ()

@@ -13,10 +13,10 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
+from dlo_calibration.outcome import Calibrated
 from dlo_calibration.simulation.protocol import Simulator
 
 SECONDS, SHARE, MOST_SECONDS = 5.0, 0.2, 60.0  # that slices may take; what is not there by then is left out
@@ -72,7 +72,7 @@ class Slices:
     complete: bool
 
 
-def cut(result: CalibrationResult, simulator: Simulator, should_stop: Callable[[], bool] = lambda: False, *,
+def cut(result: Calibrated, simulator: Simulator, should_stop: Callable[[], bool] = lambda: False, *,
         seconds: float | None = None, clock: Callable[[], float] = time.monotonic) -> Slices:
     """
     Simulate slices around a result, the coarse ones first, until the time is up.
@@ -98,7 +98,7 @@ def cut(result: CalibrationResult, simulator: Simulator, should_stop: Callable[[
     return Slices(lines, planes, cutter.count, True)
 
 
-def pairs(result: CalibrationResult) -> list[tuple[int, int]]:
+def pairs(result: Calibrated) -> list[tuple[int, int]]:
     """Return the indices of a pair or two of parameters, those that depend on each other most."""
     found = result.examination
     possible = list(combinations(range(result.space.dimension), 2))
@@ -113,11 +113,10 @@ def pairs(result: CalibrationResult) -> list[tuple[int, int]]:
 class _Cutter:
     """Evaluates points of slices, each once."""
 
-    def __init__(self, result: CalibrationResult, evaluator: Evaluator, late: Callable[[], bool]) -> None:
+    def __init__(self, result: Calibrated, evaluator: Evaluator, late: Callable[[], bool]) -> None:
         self._evaluator, self._late = evaluator, late
         self._best = result.best
-        std = np.array([estimate.std for estimate in result.parameters.values()]) / SCALE
-        reach = np.maximum(REACH * std, NARROWEST / SCALE)
+        reach = np.maximum(REACH * result.std, NARROWEST / SCALE)
         self._ends = [(max(0.0, value - one), min(1.0, value + one))
                       for value, one in zip(result.best.point.tolist(), reach.tolist(), strict=True)]
         self._seen: dict[tuple[float, ...], Evaluation] = {}

@@ -152,7 +152,7 @@ def test_hubers_loss_is_quadratic_then_linear():
 
 def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_place():
     # Of sample object2, both end where the DLO stretches too easily, and less friction makes up for it.
-    session = read_session(Path(__file__).resolve().parent.parent / 'msg_samples/object2', None)
+    session = read_session(Path(__file__).resolve().parents[2] / 'msg_samples/object2', None)
     options = Options.of(session.options or {})
     trials, _ = session_trials(session, options)
     evaluator = Evaluator(trials, options.space, CompiledSimulator())
