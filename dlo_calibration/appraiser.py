@@ -24,7 +24,14 @@ from dlo_calibration.config import Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluation import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
-from dlo_calibration.gain import covers, Gain, glimpse, information, Knowledge, knowledge
+from dlo_calibration.inference.trial_information import (
+    covers,
+    Gain,
+    glimpse,
+    information,
+    Knowledge,
+    knowledge,
+)
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial

@@ -14,11 +14,19 @@ from typing import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.advice import Advice, advise
-from dlo_calibration.confirmation import Confirmation, disagreements
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere, mean_length
-from dlo_calibration.examination import Examination, examine
+from dlo_calibration.inference.advice import Advice, advise
+from dlo_calibration.inference.confirmation import Confirmation, disagreements
+from dlo_calibration.inference.examination import Examination, examine
+from dlo_calibration.inference.missing_parameters import Explanation, explanations
+from dlo_calibration.inference.uncertainty import (
+    IDENTIFIABLE,
+    INVOLVED,
+    MODEL_ERROR,
+    spread_of_best,
+    Uncertainty,
+)
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
@@ -27,8 +35,6 @@ from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 from dlo_calibration.search import Observation, Search
 from dlo_calibration.search.huber import Huber
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.uncertainty import IDENTIFIABLE, INVOLVED, MODEL_ERROR, spread_of_best, Uncertainty
-from dlo_calibration.unexplained import Explanation, explanations
 
 PAPER_EVALUATIONS = 150
 STOPPED = 'stopped on request'

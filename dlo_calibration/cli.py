@@ -18,12 +18,12 @@ from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 from dlo_calibration import experiment_report, experiment_verb
 from dlo_calibration.calibration import CalibrationResult, simulated_chains
 from dlo_calibration.config import Declaration, declarations, Options
-from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.experiment import Observed
+from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.request import read_request, request_trials

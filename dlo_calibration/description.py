@@ -17,8 +17,8 @@ from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
-from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.errors import InputError
+from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors

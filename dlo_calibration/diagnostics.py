@@ -10,9 +10,9 @@ from typing import Any, Mapping, Sequence
 
 from dlo_calibration import findings
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.confirmation import Confirmation
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.gain import Gain
+from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.messages import MessageTypes
 from dlo_calibration.model.parameters import measured
 

@@ -13,12 +13,12 @@ import numpy as np
 from dlo_calibration.calibration import CalibrationResult
 from dlo_calibration.charts import cell_colour, Chart, CROSS, legend, RING, SQUARE, TRIANGLE
 from dlo_calibration.findings import MEAN_DISTANCE
+from dlo_calibration.inference.slices import Line, Plane, Slices
+from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.picture import horizontal_direction, INSTANT_COLOURS
-from dlo_calibration.slices import Line, Plane, Slices
-from dlo_calibration.uncertainty import DEVIATIONS
 
 MILLIMETRES = 1e3
 MEASURED, SIMULATED, BEFORE, BLUE, RED, GREY = '#111', '#e8710a', '#b4b4b4', '#2b6cb0', '#c62828', '#777'

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.gain import silent
+from dlo_calibration.inference.missing_parameters import PARTS
+from dlo_calibration.inference.trial_information import silent
+from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME, PER_WEIGHT, SCALE
-from dlo_calibration.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.unexplained import PARTS
 
 MEAN_DISTANCE = float(np.sqrt(8 / np.pi))  # of white noise in three coordinates, in its standard deviations
 

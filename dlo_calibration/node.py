@@ -44,7 +44,7 @@ from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.gain import Gain
+from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.options_node import OptionsNode

@@ -28,11 +28,11 @@ from dlo_calibration.figures import (
     plane_figure,
     trial_figure,
 )
+from dlo_calibration.inference.slices import Slices
+from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
-from dlo_calibration.slices import Slices
 from dlo_calibration.terminal import error_facts
-from dlo_calibration.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 
 MOST_TRIALS = 12  # that are drawn
 VERSIONS = ('dlo_calibration', 'numpy', 'scipy', 'numba', 'pybullet')

@@ -23,13 +23,13 @@ from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation import processes
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.inference.slices import cut, Slices
+from dlo_calibration.inference.uncertainty import good_count
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.slices import cut, Slices
-from dlo_calibration.uncertainty import good_count
 
 GUESSED = 'no trial tells anything about it; guessed from the height at which the DLO lies'
 

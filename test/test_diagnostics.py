@@ -12,7 +12,7 @@ from wire import wire
 from dlo_calibration import diagnostics
 from dlo_calibration.calibration import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.gain import Gain
+from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace

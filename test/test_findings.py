@@ -11,7 +11,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration.config import Options
 from dlo_calibration.findings import interval_text, physical_text, plain, sentences
-from dlo_calibration.uncertainty import NOT_IDENTIFIABLE, WEAK
+from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.worker import calibrate_with
 
 

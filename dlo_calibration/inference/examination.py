@@ -17,9 +17,7 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.score import PointErrors
-from dlo_calibration.uncertainty import (
+from dlo_calibration.inference.uncertainty import (
     DEVIATIONS,
     from_jacobian,
     left_out,
@@ -27,6 +25,8 @@ from dlo_calibration.uncertainty import (
     predictive_std,
     Uncertainty,
 )
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.score import PointErrors
 
 STEP = 0.03  # of the central differences, in the unit cube; contacts that come and go are smaller
 SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:

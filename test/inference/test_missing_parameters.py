@@ -10,10 +10,10 @@ from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
 
 from dlo_calibration.calibration import calibrate, explained
 from dlo_calibration.findings import sentences, values
+from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.unexplained import PARTS
 
 
 def found(trials, space=EVEN):

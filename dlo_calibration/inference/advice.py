@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
@@ -27,7 +28,6 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 
 SMALLEST_STEP, LARGEST_STEP = 0.03, 0.25  # in the unit cube: as far as the parameter is unknown, within these
 WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's

@@ -14,9 +14,9 @@ from typing import Callable, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
+from dlo_calibration.inference.outcome import Calibrated
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
-from dlo_calibration.outcome import Calibrated
 from dlo_calibration.simulation.protocol import Simulator
 
 SECONDS, SHARE, MOST_SECONDS = 5.0, 0.2, 60.0  # that slices may take; what is not there by then is left out

@@ -12,7 +12,7 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
 from dlo_calibration.config import Options
-from dlo_calibration.slices import cut, LEVELS, NARROWEST, pairs
+from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs
 from dlo_calibration.worker import calibrate_with
 
 

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from dlo_calibration.examination import examine, STEP, WIDEST
+from dlo_calibration.inference.examination import examine, STEP, WIDEST
 from dlo_calibration.model.score import PointErrors
 
 SHAPES = ((1, 20), (2, 20), (1, 20))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.examination import Examination
+from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial

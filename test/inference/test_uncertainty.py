@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dlo_calibration.uncertainty import (
+from dlo_calibration.inference.uncertainty import (
     drawn_again,
     from_jacobian,
     independence,

@@ -13,8 +13,8 @@ from toy_simulator import ToySimulator
 from dlo_calibration import cli, diagnostics, Rollout, SimulationError
 from dlo_calibration.calibration import calibrate, confirmed
 from dlo_calibration.config import Options
-from dlo_calibration.confirmation import disagreements
 from dlo_calibration.description import read_result, write_result
+from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, trial_score

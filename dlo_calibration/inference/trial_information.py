@@ -19,15 +19,15 @@ from typing import Any, Sequence
 
 import numpy as np
 
-from dlo_calibration.advice import sensitivity
+from dlo_calibration.inference.advice import sensitivity
+from dlo_calibration.inference.outcome import Calibrated
+from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites, priors
 from dlo_calibration.observation.noise import noise
-from dlo_calibration.outcome import Calibrated
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.uncertainty import UNKNOWN_STD
 
 NEW = 0.6  # share of the standard deviation that is left, at most, where a trial tells something: a repeat of
 # a trial leaves 0.71

@@ -10,9 +10,17 @@ import pytest
 from toy_simulator import REACH, toy_trial, ToySimulator
 
 from dlo_calibration import calibrate, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError
-from dlo_calibration.gain import covers, Gain, glimpse, information, knowledge, silent, told_by
+from dlo_calibration.inference.trial_information import (
+    covers,
+    Gain,
+    glimpse,
+    information,
+    knowledge,
+    silent,
+    told_by,
+)
+from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.uncertainty import UNKNOWN_STD
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
