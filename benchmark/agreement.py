@@ -21,7 +21,7 @@ from figures import SAMPLES, table, write
 import numpy as np
 
 from dlo_calibration import ParameterSpace, SimulationError, Trial
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation.bullet import BulletSimulator

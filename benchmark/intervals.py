@@ -30,13 +30,13 @@ sys.path.insert(0, str(HERE))
 from discretisation import exact_trials  # noqa: E402
 
 from dlo_calibration import Chain, ParameterSpace, Trial  # noqa: E402
-from dlo_calibration.calibration import calibrate  # noqa: E402
-from dlo_calibration.config import Options  # noqa: E402
+from dlo_calibration.calibration.calibrate import calibrate  # noqa: E402
+from dlo_calibration.calibration.options import Options  # noqa: E402
+from dlo_calibration.calibration.worker import hints  # noqa: E402
 from dlo_calibration.evaluation.evaluation import Evaluator  # noqa: E402
 from dlo_calibration.model.parameters import BY_NAME, PAPER_PARAMETERS  # noqa: E402
 from dlo_calibration.search import LeastSquares  # noqa: E402
 from dlo_calibration.simulation.compiled import CompiledSimulator  # noqa: E402
-from dlo_calibration.worker import hints  # noqa: E402
 
 NOISE = 1e-3  # m, standard deviation of a coordinate
 FITTED = ('place_end', 'drag_quarter', 'hold_middle', 'two_hands')

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import SimulationError
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.session import read_session, session_trials
 

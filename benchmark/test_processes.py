@@ -14,7 +14,7 @@ from figures import HERE, SAMPLES, side_by_side, table, write
 import pytest
 
 from dlo_calibration import calibrate
-from dlo_calibration.config import ENGINES, Options
+from dlo_calibration.calibration.options import ENGINES, Options
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.session import read_session, session_trials

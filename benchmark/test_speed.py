@@ -9,7 +9,7 @@ from figures import SAMPLES, side_by_side, table, write
 import numpy as np
 import pytest
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dlo_calibration.calibration import calibrate, CalibrationResult
+    from dlo_calibration.calibration.calibrate import calibrate, CalibrationResult
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
     from dlo_calibration.evaluation.evaluation import Evaluation
     from dlo_calibration.model.action import Action, Hand
@@ -29,7 +29,7 @@ __all__ = [
 
 _HOMES = {
     'model.action': ('Action', 'Hand'),
-    'calibration': ('calibrate', 'CalibrationResult'),
+    'calibration.calibrate': ('calibrate', 'CalibrationResult'),
     'model.chain': ('Chain',),
     'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
     'evaluation.evaluation': ('Evaluation',),

@@ -16,10 +16,11 @@ import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
 from dlo_calibration import experiment_report, experiment_verb
-from dlo_calibration.calibration import CalibrationResult, simulated_chains
-from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.calibration.calibrate import CalibrationResult, simulated_chains
+from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.options import Declaration, declarations, Options
+from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 from dlo_calibration.description import Description, read_result, write_result
-from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.experiment import Observed
@@ -29,7 +30,6 @@ from dlo_calibration.recording import SessionWriter
 from dlo_calibration.request import read_request, request_trials
 from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 
 PROGRAM = 'dlo-calibration'
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' convention

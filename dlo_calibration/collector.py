@@ -43,7 +43,7 @@ from bisect import bisect_right, insort
 from itertools import pairwise
 from typing import Iterable
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import INITIAL
 from dlo_calibration.model.trial import Trial

@@ -21,8 +21,8 @@ import time
 from typing import Any, Callable, Iterator, Sequence
 
 from dlo_calibration import findings, terminal
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import document, validated
-from dlo_calibration.config import Options
 from dlo_calibration.description import read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError

@@ -23,13 +23,13 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import fitted_with, SimulatorFactory
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.worker import fitted_with, SimulatorFactory
 
 #: Options that change nothing in what a calibration finds.
 WITHOUT_EFFECT = ('workers', 'scheduler', 'start_after_trials', 'output_directory', 'record')

@@ -16,7 +16,8 @@ import time
 from typing import Any, Callable, Iterator, Mapping, Protocol, Sequence, TextIO
 
 from dlo_calibration import experiment_report as report
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import (
@@ -34,7 +35,6 @@ from dlo_calibration.picture import session_picture
 from dlo_calibration.samples import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.terminal import TaskBar
-from dlo_calibration.worker import SimulatorFactory
 
 JOURNAL, SCATTER = 'calibrations.jsonl', 'parameters.png'
 RUNS = 20  # the paper's

@@ -10,7 +10,7 @@ from typing import Iterator
 
 import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.charts import cell_colour, Chart, CROSS, legend, RING, SQUARE, TRIANGLE
 from dlo_calibration.findings import MEAN_DISTANCE
 from dlo_calibration.inference.slices import Line, Plane, Slices

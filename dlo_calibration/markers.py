@@ -9,7 +9,7 @@ from typing import Any, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.messages import MessageTypes
 from dlo_calibration.model.action import Hand

@@ -35,13 +35,14 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from dlo_calibration import diagnostics, messages
-from dlo_calibration.appraiser import Appraiser
-from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.live_information import Appraiser
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
 from dlo_calibration.collector import KEPT, TrialCollector
-from dlo_calibration.config import Options
 from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
-from dlo_calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.trial_information import Gain
@@ -49,7 +50,6 @@ from dlo_calibration.markers import markers
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.options_node import OptionsNode
 from dlo_calibration.recorder import Recorder
-from dlo_calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
 
 LOG = logging.getLogger('dlo_calibration')  # notices of the rest of the package
 DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
 
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')  # declared by rclpy

@@ -15,7 +15,7 @@ import json
 import sys
 import textwrap
 
-from dlo_calibration.config import Declaration, declarations
+from dlo_calibration.calibration.options import Declaration, declarations
 
 HEAD = """\
 Parameters of the node calibrator, with their defaults.  To change some, copy this file, change their

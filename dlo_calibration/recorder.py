@@ -9,14 +9,14 @@ from pathlib import Path
 import time
 from typing import Callable
 
-from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.description import write_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.recording import RecordingError, SessionWriter
 from dlo_calibration.report import Origin, repeating_command, write_evaluations
 from dlo_calibration.reporter import Reporter
-from dlo_calibration.worker import SimulatorFactory
 
 
 class Recorder:

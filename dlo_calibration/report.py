@@ -18,8 +18,8 @@ from typing import Any, Iterable, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration import findings
-from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.config import declarations, Options
+from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.figures import (
     convergence_figure,

@@ -19,7 +19,7 @@ from typing import Any, Mapping, Union
 
 import numpy as np
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, frozen_array

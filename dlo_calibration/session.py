@@ -20,8 +20,8 @@ from mcap.records import Channel, DataEnd, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from ruamel.yaml import YAML
 
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.collector import TrialCollector
-from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import (
     action_trajectory,

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from dlo_calibration import findings
-from dlo_calibration.calibration import CalibrationResult
+from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 

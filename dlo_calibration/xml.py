@@ -24,7 +24,7 @@ from typing import Any, Iterator, Mapping
 from lxml import etree
 import numpy as np
 
-from dlo_calibration.config import Declaration, declarations, Options
+from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
 

@@ -22,12 +22,12 @@ from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli
-from dlo_calibration.config import declarations, Options
+from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.description import read_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import bag_types, INITIAL
 from dlo_calibration.session import read_session
-from dlo_calibration.worker import calibrate_with
 
 FIT_KEYS = {
     'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from dlo_calibration import collector as module
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.collector import TrialCollector
-from dlo_calibration.config import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import ActionMessage, ChainMessage, GOAL, INITIAL
 from dlo_calibration.model.chain import Chain

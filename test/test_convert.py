@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.session import read_session, session_trials
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration.calibration import calibrate
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import calibrate
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.description import (
     Description,
     description_document,

@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from dlo_calibration.config import declarations
+from dlo_calibration.calibration.options import declarations
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,8 +59,8 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     """Execute the three lines of README on a result that was fitted and written."""
     import pybullet
 
-    from dlo_calibration.calibration import calibrate
-    from dlo_calibration.config import Options
+    from dlo_calibration.calibration.calibrate import calibrate
+    from dlo_calibration.calibration.options import Options
     from dlo_calibration.description import read_result, write_result
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.parameters import ParameterSpace

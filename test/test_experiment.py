@@ -12,8 +12,9 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
-from dlo_calibration.calibration import calibrate
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import calibrate
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import hints
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment import (
     Journal,
@@ -29,7 +30,6 @@ from dlo_calibration.experiment import (
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.worker import hints
 
 OPTIONS = Options.of({'evaluations': 40})
 

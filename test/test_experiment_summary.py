@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from toy_messages import toy_trials
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.experiment import Judgement, Observed, Outcome, Subject, Task
 from dlo_calibration.experiment_summary import Spread, summary
 

@@ -9,10 +9,10 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.findings import interval_text, physical_text, plain, sentences
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.worker import calibrate_with
 
 
 @pytest.fixture(scope='module')

@@ -16,7 +16,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from dlo_calibration import diagnostics
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.messages import bag_types, INPUT_TYPES

@@ -12,7 +12,7 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import toy_trial, ToySimulator
 from wire import wire
 
-from dlo_calibration.calibration import calibrate
+from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.markers import error_colour, markers, MOST_POINTS
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace

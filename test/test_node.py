@@ -21,7 +21,7 @@ from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli, InputError
-from dlo_calibration.config import declarations, Options
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.description import read_description, read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES, result_values
 from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
@@ -40,7 +40,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from dlo_calibration.engines import make_simulator  # noqa: E402
+from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
 from dlo_calibration.node import CalibratorNode  # noqa: E402
 
 PATIENCE = 60.0  # s
@@ -452,7 +452,7 @@ def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start_node):
 
 def test_notices_of_the_package_are_in_the_log_of_the_node(start_node):
     robot = start_node()
-    logging.getLogger('dlo_calibration.engines').warning('numba is not installed')
+    logging.getLogger('dlo_calibration.calibration.engines').warning('numba is not installed')
     robot.until(lambda: any(entry.msg == 'numba is not installed' and entry.level == LOG_WARN
                             for entry in robot.heard['log']))
 

@@ -10,7 +10,7 @@ import sys
 import pytest
 from ruamel.yaml import YAML
 
-from dlo_calibration.config import declarations, Options
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,12 +19,12 @@ import pytest
 from toy_messages import toy_trials
 from toy_simulator import ToySimulator
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.slices import cut
 from dlo_calibration.report import digests, MOST_TRIALS, Origin, repeating_command, write_report
-from dlo_calibration.worker import calibrate_with
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 QUIET = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',

@@ -9,10 +9,10 @@ import pytest
 from toy_messages import toy_trials
 from toy_simulator import ToySimulator
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.report import Origin
 from dlo_calibration.reporter import Reporter
-from dlo_calibration.worker import calibrate_with
 
 OPTIONS = Options.of({'workers': 1, 'evaluations': 20})
 ORIGIN = Origin('session', 'a command', OPTIONS)

@@ -17,7 +17,8 @@ from toy_messages import toy_trials
 from toy_simulator import ToySimulator
 
 from dlo_calibration import cli
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.description import read_description, read_result
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
@@ -40,7 +41,6 @@ from dlo_calibration.request import (
     TrialRequest,
     write_request,
 )
-from dlo_calibration.worker import calibrate_with
 
 SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples' / 'xml'
 REQUESTS = sorted(file for file in SAMPLES.glob('*.xml') if 'calibration_request' in file.read_text(

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import (

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.collector import TrialCollector
-from dlo_calibration.config import Options
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal, Trial

@@ -18,12 +18,12 @@ from toy_simulator import ToySimulator
 from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRONG
 
 from dlo_calibration import InputError
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.collector import TrialCollector
-from dlo_calibration.config import Options
 from dlo_calibration.messages import bag_types, INPUT_TYPES, read
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.session import decode, encode, read_session, Record, session_trials
-from dlo_calibration.worker import calibrate_with
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)

@@ -19,10 +19,10 @@ from toy_simulator import ToySimulator
 from wrong_input import mutations
 
 from dlo_calibration import cli, InputError, recording
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.messages import bag_types, INITIAL
 from dlo_calibration.session import read_session, session_trials
-from dlo_calibration.worker import calibrate_with
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)

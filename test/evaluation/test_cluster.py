@@ -18,9 +18,9 @@ from toy_messages import toy_trials
 from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import DloCalibrationError, InputError
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.evaluation import cluster
-from dlo_calibration.worker import calibrate_with
 
 distributed = pytest.importorskip('distributed', reason='the extra "distributed" of setup.py has it')
 

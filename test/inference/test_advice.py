@@ -10,7 +10,7 @@ import pytest
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import calibrate, Chain, Goal, ParameterSpace, Rollout, SimulationError, Trial
-from dlo_calibration.calibration import advised
+from dlo_calibration.calibration.calibrate import advised
 from dlo_calibration.inference.advice import advise, candidates, expected_std
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
 from dlo_calibration.search import SEARCHES

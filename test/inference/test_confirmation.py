@@ -11,8 +11,9 @@ from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
 
 from dlo_calibration import cli, diagnostics, Rollout, SimulationError
-from dlo_calibration.calibration import calibrate, confirmed
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import calibrate, confirmed
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.description import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages import bag_types
@@ -21,7 +22,6 @@ from dlo_calibration.model.score import PointErrors, residuals, trial_score
 from dlo_calibration.report import Origin, write_report
 from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.terminal import error_facts
-from dlo_calibration.worker import calibrate_with
 
 OPTIONS = Options(evaluations=20, workers=1)
 
@@ -161,7 +161,7 @@ def test_a_stopped_search_is_confirmed_too():
 
 
 def test_a_confirmation_that_takes_too_long_after_a_stop_is_given_up(monkeypatch):
-    monkeypatch.setattr('dlo_calibration.worker.STOPPED_PATIENCE', -1.0)
+    monkeypatch.setattr('dlo_calibration.calibration.worker.STOPPED_PATIENCE', -1.0)
     count = []
     result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy()), count.append,
                             lambda: len(count) >= 3)

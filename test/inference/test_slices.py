@@ -11,9 +11,9 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs
-from dlo_calibration.worker import calibrate_with
 
 
 @pytest.fixture(scope='module')

@@ -176,7 +176,7 @@ from dlo_calibration.model import parameters
 new = parameters.Parameter('stickiness', 'glue', 'N', 1.0, 100.0, 50.0, 'how it sticks')
 parameters.PARAMETERS += (new,)
 parameters.BY_NAME = {parameter.name: parameter for parameter in parameters.PARAMETERS}
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 assert 'stickiness' in Options().flat()
 space = Options.of({'calibrate': ['stickiness']}).space
 assert space.physical(space.values([1.0]), 1.0)['stickiness'] == 100.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from resting import hung, LENGTH, observed, trial_of
 
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial

@@ -12,7 +12,7 @@ import pytest
 from test_rod import crumpled, GRAVITY, straight
 
 from dlo_calibration import Chain, PARAMETERS, ParameterSpace, SimulationError
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation import kernels

@@ -9,13 +9,13 @@ import functools
 import logging
 from typing import Any, Callable, Mapping
 
-from dlo_calibration.config import AUTO, Options
+from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.protocol import Simulator
 
 INSTALL = 'pip install numba, or apt install python3-numba'
 SLOWER = 'rounds are simulated by PyBullet, about 30 times slower, because'
-LOG = logging.getLogger('dlo_calibration.engines')
+LOG = logging.getLogger('dlo_calibration.calibration.engines')
 
 
 def _bullet(options: Options) -> Simulator:

@@ -12,11 +12,11 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
-from dlo_calibration.appraiser import Appraiser
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.live_information import Appraiser
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.trial import Goal
-from dlo_calibration.worker import calibrate_with
 
 PATIENCE = 60.0
 OPTIONS = Options.of({'calibrate': ['flexibility', 'friction'], 'elasticity': TRUTH['elasticity'],

@@ -18,13 +18,13 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation
-from dlo_calibration.config import ENGINES as ENGINE_NAMES
-from dlo_calibration.config import Options
-from dlo_calibration.engines import ENGINES
+from dlo_calibration.calibration.engines import ENGINES
+from dlo_calibration.calibration.options import ENGINES as ENGINE_NAMES
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
 from dlo_calibration.evaluation import processes
-from dlo_calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Iterator, Mapping
 
-from dlo_calibration.calibration import PAPER_EVALUATIONS
+from dlo_calibration.calibration.calibrate import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.parameters import (
     BY_NAME,

@@ -17,8 +17,9 @@ import time
 import traceback
 from typing import Callable, Iterator, Sequence, Union
 
-from dlo_calibration.calibration import advised, calibrate, CalibrationResult, confirmed, explained
-from dlo_calibration.config import AUTO, CONFIRMING, Options
+from dlo_calibration.calibration.calibrate import advised, calibrate, CalibrationResult, confirmed, explained
+from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
+from dlo_calibration.calibration.parts import calibrate_parts
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation import processes
 from dlo_calibration.evaluation.cluster import ClusterExecutor
@@ -27,7 +28,6 @@ from dlo_calibration.inference.slices import cut, Slices
 from dlo_calibration.inference.uncertainty import good_count
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, SEARCHES
 from dlo_calibration.simulation.protocol import Simulator
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import pytest
 
 from dlo_calibration import InputError
-from dlo_calibration.config import declarations, FIXED_VALUES, Options
+from dlo_calibration.calibration.options import declarations, FIXED_VALUES, Options
 from dlo_calibration.model.parameters import PARAMETERS
 from dlo_calibration.search import SEARCHES
 

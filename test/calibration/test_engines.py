@@ -8,13 +8,13 @@ import sys
 
 import pytest
 
-from dlo_calibration import engines
-from dlo_calibration.config import ENGINES as NAMES
-from dlo_calibration.config import Options
-from dlo_calibration.engines import ENGINES, make_simulator
+from dlo_calibration.calibration import engines
+from dlo_calibration.calibration.engines import ENGINES, make_simulator
+from dlo_calibration.calibration.options import ENGINES as NAMES
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.bullet import BulletSimulator
-from dlo_calibration.worker import calibrate_with
 
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')

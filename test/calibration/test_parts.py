@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_calibration.calibration.parts import calibrate_parts
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.parts import calibrate_parts
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
 

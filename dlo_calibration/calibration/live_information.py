@@ -19,8 +19,9 @@ import queue
 import threading
 from typing import Any, Iterator, Sequence, Union
 
-from dlo_calibration.calibration import CalibrationResult
-from dlo_calibration.config import Options
+from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluation import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
@@ -36,7 +37,6 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.worker import SimulatorFactory
 
 LOOK = 0.05  # s between two looks at whether to stop
 
