@@ -54,7 +54,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import DloCalibrationError, InputError
-from dlo_calibration.messages import (
+from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
     ActionMessage,

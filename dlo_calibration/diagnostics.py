@@ -13,7 +13,7 @@ from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.trial_information import Gain
-from dlo_calibration.messages import MessageTypes
+from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.parameters import measured
 
 OUTPUT_TYPES: Mapping[str, str] = {

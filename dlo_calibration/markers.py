@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.diagnostics import OUTPUT_TYPES
-from dlo_calibration.messages import MessageTypes
+from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.score import PointErrors, residuals

@@ -34,20 +34,21 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from dlo_calibration import diagnostics, messages
+from dlo_calibration import diagnostics
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.live_information import Appraiser
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
-from dlo_calibration.collector import KEPT, TrialCollector
 from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.markers import markers
-from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages import codec
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.collector import KEPT, TrialCollector
 from dlo_calibration.options_node import OptionsNode
 from dlo_calibration.recorder import Recorder
 
@@ -142,7 +143,7 @@ class CalibratorNode(OptionsNode):
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
         super().__init__('calibrator', **arguments)
-        self._types = messages.rclpy_types()
+        self._types = codec.rclpy_types()
         self._collector = TrialCollector(self.options())
         self._collected_with = self.options()
         self._make_simulator = make_simulator
@@ -240,7 +241,7 @@ class CalibratorNode(OptionsNode):
             except Exception as error:  # whatever the decoder meets in damaged bytes
                 raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
                                  'check what publishes it') from error
-            self._collector.add(messages.read(kind, message))
+            self._collector.add(codec.read(kind, message))
             for refusal in self._collector.take_news():
                 self.refuse(str(refusal))
         except InputError as error:

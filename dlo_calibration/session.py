@@ -21,9 +21,8 @@ from mcap.stream_reader import StreamReader
 from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.collector import TrialCollector
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import (
+from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
     bag_types,
@@ -31,6 +30,8 @@ from dlo_calibration.messages import (
     INPUT_TYPES,
     read,
 )
+from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.recording import (
     METADATA_FILE,
@@ -40,7 +41,6 @@ from dlo_calibration.recording import (
     SessionWriter,
     typestore,
 )
-from dlo_calibration.trial_messages import trial_messages
 
 __all__ = ['Record', 'RecordingError', 'Session', 'SessionWriter', 'decode', 'encode', 'read_session',
            'session_trials']

@@ -18,7 +18,7 @@ from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.messages import ActionMessage, ChainMessage, INPUT_TYPES, NANOSECONDS, read
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, INPUT_TYPES, NANOSECONDS, read
 from dlo_calibration.session import read_session
 
 HERE = Path(__file__).resolve().parent

@@ -26,7 +26,7 @@ from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.description import read_result
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import bag_types, INITIAL
+from dlo_calibration.messages.codec import bag_types, INITIAL
 from dlo_calibration.session import read_session
 
 FIT_KEYS = {

@@ -20,7 +20,7 @@ from toy_calibrator import make_toy
 from toy_messages import session_messages, TRUTH, write_session
 
 from dlo_calibration import cli
-from dlo_calibration.messages import bag_types
+from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.samples import samples
 
 PATIENCE = 60.0

@@ -19,7 +19,7 @@ from dlo_calibration import diagnostics
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.messages import bag_types, INPUT_TYPES
+from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
 
 ROOT = Path(__file__).resolve().parents[1]
 LAUNCH_FILE = ROOT / 'launch' / 'calibrator.launch.py'

@@ -24,7 +24,7 @@ from dlo_calibration import cli, InputError
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.description import read_description, read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES, result_values
-from dlo_calibration.messages import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
 from dlo_calibration.session import read_session
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')

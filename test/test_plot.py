@@ -12,7 +12,7 @@ from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 
 from dlo_calibration import cli
-from dlo_calibration.messages import bag_types
+from dlo_calibration.messages.codec import bag_types
 
 
 @pytest.fixture

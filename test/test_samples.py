@@ -17,8 +17,8 @@ from wire import wire
 
 from dlo_calibration import calibrate, cli, ParameterSpace
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.collector import TrialCollector
-from dlo_calibration.messages import ACTION, INPUT_TYPES, read
+from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
+from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.session import read_session
 from dlo_calibration.simulation.bullet import BulletSimulator

@@ -26,7 +26,7 @@ from ruamel.yaml import YAML
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import (
+from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
     ActionMessage,

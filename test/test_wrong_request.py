@@ -21,7 +21,7 @@ from wrong_input import mutations
 from dlo_calibration import cli, InputError, recording
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.messages import bag_types, INITIAL
+from dlo_calibration.messages.codec import bag_types, INITIAL
 from dlo_calibration.session import read_session, session_trials
 
 FILES = bag_types()

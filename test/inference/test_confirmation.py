@@ -16,7 +16,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.description import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
-from dlo_calibration.messages import bag_types
+from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, trial_score
 from dlo_calibration.report import Origin, write_report

@@ -7,7 +7,7 @@ import numpy as np
 from toy_simulator import toy_trial
 
 from dlo_calibration import Trial
-from dlo_calibration.messages import (
+from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
     ActionMessage,

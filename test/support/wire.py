@@ -6,15 +6,15 @@
 import numpy as np
 import pytest
 
-from dlo_calibration import messages
+from dlo_calibration.messages import codec
 
 
 def graph_types():
     pytest.importorskip('sensor_msgs.msg', reason='the message classes of ROS 2 are not installed')
-    return messages.rclpy_types()
+    return codec.rclpy_types()
 
 
-SOURCES = {'rosbags': messages.bag_types, 'rclpy': graph_types}
+SOURCES = {'rosbags': codec.bag_types, 'rclpy': graph_types}
 
 
 def wire(types):

@@ -10,11 +10,11 @@ from typing import Sequence, Union
 
 import numpy as np
 
-from dlo_calibration.messages import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
+from dlo_calibration.messages.trial_builder import order
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.segment import order
 
 EPOCH = 1_700_000_000 * NANOSECONDS  # of the first trial
 PAUSE = 10 * NANOSECONDS  # between two trials

@@ -45,9 +45,9 @@ from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import INITIAL
+from dlo_calibration.messages.codec import INITIAL
+from dlo_calibration.messages.trial_builder import Key, Message, order, Segment
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.segment import Key, Message, order, Segment
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
+from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Goal, Trial

@@ -20,8 +20,8 @@ from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRO
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.collector import TrialCollector
-from dlo_calibration.messages import bag_types, INPUT_TYPES, read
+from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
+from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.recording import SessionWriter
 from dlo_calibration.session import decode, encode, read_session, Record, session_trials
 

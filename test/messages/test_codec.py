@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from wire import SOURCES, wire
 
-from dlo_calibration import messages
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import ACTION, ActionMessage, GOAL, INITIAL, read
+from dlo_calibration.messages import codec
+from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, read
 from dlo_calibration.model.chain import Chain
 
 STAMP = 12_500_000_000
@@ -28,7 +28,7 @@ def curve(count=21, length=1.0):
 
 
 def cloud(types, **changes):
-    message = messages.chain_cloud(types, Chain(curve()), STAMP, 'world')
+    message = codec.chain_cloud(types, Chain(curve()), STAMP, 'world')
     for name, value in changes.items():
         setattr(message, name, value)
     return message
@@ -58,7 +58,7 @@ def refusal(kind, message):
 @pytest.mark.parametrize('single', [False, True])
 def test_written_chain_is_read_back(types, single):
     chain = Chain(curve(), np.arange(21) % 3, np.arange(21) == 4)
-    found = read(GOAL, messages.chain_cloud(types, chain, STAMP, 'world', single=single))
+    found = read(GOAL, codec.chain_cloud(types, chain, STAMP, 'world', single=single))
     assert (found.kind, found.stamp, found.frame_id) == (GOAL, STAMP, 'world')
     expected = chain.points.astype(np.float32) if single else chain.points
     np.testing.assert_array_equal(found.chain.points, expected)
@@ -75,7 +75,7 @@ def test_bare_cloud_has_no_annotation(types):
 
 
 def test_hand_field_of_zeros_tells_that_no_hand_holds(types):
-    message = messages.chain_cloud(types, Chain(curve(), np.zeros(21)), STAMP, 'world')
+    message = codec.chain_cloud(types, Chain(curve(), np.zeros(21)), STAMP, 'world')
     np.testing.assert_array_equal(read(GOAL, message).chain.hands, np.zeros(21))
 
 
@@ -169,7 +169,7 @@ def test_unusable_field_is_refused(types, fields, words):
 
 
 def test_hand_beyond_eight_is_refused(types):
-    message = messages.chain_cloud(types, Chain(curve(), np.full(21, 9)), STAMP, 'world')
+    message = codec.chain_cloud(types, Chain(curve(), np.full(21, 9)), STAMP, 'world')
     assert 'hand 9, expected 0 for none, or 1 to 8' in refusal(INITIAL, message)
 
 
@@ -189,7 +189,7 @@ def test_unusable_points_are_refused(types, index, value, words):
 @pytest.mark.parametrize(('seconds', 'words'), [
     (0, 'stamped 0 s: got a stamp of zero'), (-3, 'stamped -3 s: got a negative stamp')])
 def test_stamp_must_be_a_time(types, kind, seconds, words):
-    message = messages.action_trajectory(types, action()) if kind == ACTION else cloud(types)
+    message = codec.action_trajectory(types, action()) if kind == ACTION else cloud(types)
     message.header.stamp.sec, message.header.stamp.nanosec = seconds, 0
     with pytest.raises(InputError, match=f'{kind} {words}'):
         read(kind, message)
@@ -198,7 +198,7 @@ def test_stamp_must_be_a_time(types, kind, seconds, words):
 # ---- reading actions
 
 def test_written_action_is_read_back(types):
-    found = read(ACTION, messages.action_trajectory(types, action()))
+    found = read(ACTION, codec.action_trajectory(types, action()))
     assert (found.kind, found.stamp, found.frame_id) == (ACTION, STAMP, 'world')
     assert found.names == ('left_hand', 'right_hand')
     for name in ('times', 'positions', 'orientations'):
@@ -206,7 +206,7 @@ def test_written_action_is_read_back(types):
 
 
 def test_velocities_of_an_action_are_ignored(types):
-    message = messages.action_trajectory(types, action())
+    message = codec.action_trajectory(types, action())
     zero = types.build('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
     message.points[0].velocities = [types.build('geometry_msgs/msg/Twist', linear=zero, angular=zero)]
     np.testing.assert_array_equal(read(ACTION, message).positions, action().positions)
@@ -248,13 +248,13 @@ def set_transform(message, part, **changes):
      'NaN or infinity in translation of trajectory point 1'),
 ])
 def test_unusable_action_is_refused(types, spoil, words):
-    message = messages.action_trajectory(types, action())
+    message = codec.action_trajectory(types, action())
     spoil(message)
     assert words in refusal(ACTION, message)
 
 
 def test_action_of_nine_hands_is_refused(types):
-    nine = messages.action_trajectory(types, action(
+    nine = codec.action_trajectory(types, action(
         names=tuple('abcdefgh'), times=[0.0], positions=np.zeros((1, 8, 3)),
         orientations=np.tile([0.0, 0.0, 0.0, 1.0], (1, 8, 1))))
     assert len(read(ACTION, nine).names) == 8
@@ -267,15 +267,15 @@ def test_written_messages_cross_the_wire(types):
     """All that is written can be serialised and comes back as it was."""
     travel = wire(types)
     chain = Chain(curve(), np.arange(21) % 2, np.arange(21) == 4)
-    found = read(INITIAL, travel(messages.chain_cloud(types, chain, STAMP, 'world')))
+    found = read(INITIAL, travel(codec.chain_cloud(types, chain, STAMP, 'world')))
     np.testing.assert_array_equal(found.chain.points, chain.points)
     np.testing.assert_array_equal(found.chain.hands, chain.hands)
     np.testing.assert_array_equal(
-        read(ACTION, travel(messages.action_trajectory(types, action()))).positions, action().positions)
+        read(ACTION, travel(codec.action_trajectory(types, action()))).positions, action().positions)
 
 
 def test_module_loads_no_message_package():
-    code = ('import sys, dlo_calibration.messages\n'
+    code = ('import sys, dlo_calibration.messages.codec\n'
             'print(sorted({"rclpy", "rosbags", "sensor_msgs"} & set(sys.modules)))')
     printed = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
     assert printed == '[]\n'

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from dlo_calibration import collector as module
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.collector import TrialCollector
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages import ActionMessage, ChainMessage, GOAL, INITIAL
+from dlo_calibration.messages import collector as module
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL
+from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.chain import Chain
 
 START = 1_700_000_000.0
