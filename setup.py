@@ -34,7 +34,7 @@ setup(
     maintainer_email='dlo_calibration@example.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'schema/*.xsd']},
+    package_data={NAME: ['py.typed', 'files/schema/*.xsd']},
     data_files=shared_files(),
     zip_safe=False,
     python_requires='>=3.11',

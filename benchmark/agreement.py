@@ -22,8 +22,8 @@ import numpy as np
 
 from dlo_calibration import ParameterSpace, SimulationError, Trial
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.protocol import Simulator

@@ -54,6 +54,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.files.session import encode, SessionWriter
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -66,7 +67,6 @@ from dlo_calibration.messages.codec import (
     INPUT_TYPES,
 )
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.session import encode, SessionWriter
 
 Floats = NDArray[np.float64]
 Message = Union[ChainMessage, ActionMessage]

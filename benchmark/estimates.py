@@ -25,9 +25,9 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 from dlo_calibration.calibration.options import Options  # noqa: E402
+from dlo_calibration.files.session import read_session, session_trials  # noqa: E402
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace  # noqa: E402
 from dlo_calibration.observation.estimate import estimate  # noqa: E402
-from dlo_calibration.session import read_session, session_trials  # noqa: E402
 
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data'))
 PROPERTIES = {'flexibility': 'EI', 'elasticity': 'EA', 'friction': 'mu', 'self_collision': 'radius'}

@@ -23,9 +23,9 @@ from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import hints
 from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Observation, SEARCHES
 from dlo_calibration.search.huber import Huber
-from dlo_calibration.session import read_session, session_trials
 
 HERE = Path(__file__).resolve().parent
 BUDGET = 150

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from dlo_calibration import demo, node  # noqa: E402 - where there is a ROS
-from dlo_calibration.session import read_session  # noqa: E402
+from dlo_calibration.files.session import read_session  # noqa: E402
 from dlo_calibration.signals import StopFlag  # noqa: E402
 
 SAMPLE = Path(__file__).resolve().parent.parent / 'msg_samples' / 'object1'

@@ -13,7 +13,7 @@ import pytest
 from dlo_calibration import SimulationError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.processes import ProcessExecutor
-from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, session_trials
 
 #: engine -> rounds
 ROUNDS = {'compiled': 10_000, 'bullet': 1_000}

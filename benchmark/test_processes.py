@@ -16,8 +16,8 @@ import pytest
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import ENGINES, Options
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import RandomSearch
-from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator

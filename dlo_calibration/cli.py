@@ -20,15 +20,15 @@ from dlo_calibration.calibration.calibrate import CalibrationResult, simulated_c
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
-from dlo_calibration.description import Description, read_result, write_result
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.experiment import Observed
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.request import read_request, request_trials
+from dlo_calibration.files.result import Description, read_result, write_result
+from dlo_calibration.files.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.recording import SessionWriter
-from dlo_calibration.request import read_request, request_trials
-from dlo_calibration.session import read_session, Session, session_trials, trial_records
 from dlo_calibration.signals import StopFlag
 
 PROGRAM = 'dlo-calibration'

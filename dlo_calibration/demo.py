@@ -23,13 +23,13 @@ from typing import Any, Callable, Iterator, Sequence
 from dlo_calibration import findings, terminal
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import document, validated
-from dlo_calibration.description import read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.files.result import read_result
+from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import read_session, Session, session_trials
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.picture import session_picture
-from dlo_calibration.samples import samples
-from dlo_calibration.session import read_session, Session, session_trials
 from dlo_calibration.signals import StopFlag
 
 NODE = '/calibrator'

@@ -31,8 +31,8 @@ from dlo_calibration.experiment import (
     tasks,
 )
 from dlo_calibration.experiment_summary import complete_runs, run_score, summary
+from dlo_calibration.files.samples import samples
 from dlo_calibration.picture import session_picture
-from dlo_calibration.samples import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.terminal import TaskBar
 

@@ -40,10 +40,10 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.live_information import Appraiser
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
-from dlo_calibration.description import description_document
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.files.result import description_document
 from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.markers import markers
 from dlo_calibration.messages import codec

@@ -12,9 +12,9 @@ from typing import Callable
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import SimulatorFactory
-from dlo_calibration.description import write_result
 from dlo_calibration.errors import InputError
-from dlo_calibration.recording import RecordingError, SessionWriter
+from dlo_calibration.files.recording import RecordingError, SessionWriter
+from dlo_calibration.files.result import write_result
 from dlo_calibration.report import Origin, repeating_command, write_evaluations
 from dlo_calibration.reporter import Reporter
 

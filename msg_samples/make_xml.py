@@ -23,7 +23,9 @@ import numpy as np
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.description import write_result
+from dlo_calibration.files.request import GoalRequest, Request, TrialRequest, write_request
+from dlo_calibration.files.result import write_result
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import (
@@ -35,8 +37,6 @@ from dlo_calibration.model.named_actions import (
     Release,
     TwoHands,
 )
-from dlo_calibration.request import GoalRequest, Request, TrialRequest, write_request
-from dlo_calibration.session import read_session, session_trials
 
 HERE = Path(__file__).resolve().parent
 MASS = 0.03

@@ -18,8 +18,8 @@ from typing import Sequence
 
 import numpy as np
 
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, INPUT_TYPES, NANOSECONDS, read
-from dlo_calibration.session import read_session
 
 HERE = Path(__file__).resolve().parent
 EVERY = 2

@@ -24,10 +24,10 @@ from toy_simulator import Deadly, ToySimulator
 from dlo_calibration import cli
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.description import read_result
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.result import read_result
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INITIAL
-from dlo_calibration.session import read_session
 
 FIT_KEYS = {
     'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, session_trials
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -13,7 +13,7 @@ from processes import children
 import pytest
 
 from dlo_calibration.demo import samples
-from dlo_calibration.session import read_session
+from dlo_calibration.files.session import read_session
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('pybullet', reason='needs PyBullet')

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from dlo_calibration.session import read_session
+from dlo_calibration.files.session import read_session
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 

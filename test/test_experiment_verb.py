@@ -20,8 +20,8 @@ from toy_calibrator import make_toy
 from toy_messages import session_messages, TRUTH, write_session
 
 from dlo_calibration import cli
+from dlo_calibration.files.samples import samples
 from dlo_calibration.messages.codec import bag_types
-from dlo_calibration.samples import samples
 
 PATIENCE = 60.0
 SMALL = ('--runs', 2, '--search', 'random', '--evaluations', 6)

@@ -22,10 +22,10 @@ from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli, InputError
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.description import read_description, read_result
 from dlo_calibration.diagnostics import OUTPUT_TYPES, result_values
+from dlo_calibration.files.result import read_description, read_result
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
-from dlo_calibration.session import read_session
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')

@@ -14,7 +14,7 @@ from dlo_calibration import cli, diagnostics, Rollout, SimulationError
 from dlo_calibration.calibration.calibrate import calibrate, confirmed
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.description import read_result, write_result
+from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace

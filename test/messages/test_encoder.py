@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.request import read_request, request_trials
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.request import read_request, request_trials
-from dlo_calibration.session import read_session, session_trials
 
 SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
 POINTS = np.stack([np.linspace(0, 0.5, 6), 0.01 * np.arange(6) ** 2, 0.004 + np.zeros(6)], axis=1)

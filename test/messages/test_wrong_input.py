@@ -20,10 +20,10 @@ from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRO
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.session import decode, encode, read_session, Record, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
-from dlo_calibration.recording import SessionWriter
-from dlo_calibration.session import decode, encode, read_session, Record, session_trials
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)

@@ -11,11 +11,11 @@ import pytest
 from resting import hung, LENGTH, observed, trial_of
 
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.estimate import estimate
-from dlo_calibration.session import read_session, session_trials
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get('DLO_DATA', ROOT / '../shared/data'))

@@ -11,9 +11,9 @@ import pytest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import hints as known_from
 from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.search.huber import Huber
-from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 TRUTH = np.array([0.62, 0.35, 0.5])

@@ -13,8 +13,8 @@ from test_rod import crumpled, GRAVITY, straight
 
 from dlo_calibration import Chain, PARAMETERS, ParameterSpace, SimulationError
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.session import read_session, session_trials
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator

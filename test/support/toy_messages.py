@@ -7,6 +7,8 @@ import numpy as np
 from toy_simulator import toy_trial
 
 from dlo_calibration import Trial
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.session import encode
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -17,8 +19,6 @@ from dlo_calibration.messages.codec import (
     INPUT_TYPES,
     MessageTypes,
 )
-from dlo_calibration.recording import SessionWriter
-from dlo_calibration.session import encode
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 SECOND = 10**9

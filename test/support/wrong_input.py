@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import numpy as np
 from toy_messages import MINUTE, SECOND, toy_trials, trial_messages
 
+from dlo_calibration.files.session import encode
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -27,7 +28,6 @@ from dlo_calibration.messages.codec import (
     UINT8,
 )
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.session import encode
 
 INT16, INT32 = 3, 5  # sensor_msgs/PointField
 LATE = 130 * SECOND  # after the two good trials, which begin at 60 and 120 s

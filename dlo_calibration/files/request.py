@@ -21,11 +21,7 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Action, Hand, NO_ROTATION
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
-from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.xml import (
+from dlo_calibration.files.xml import (
     add,
     add_chain,
     add_options,
@@ -41,6 +37,10 @@ from dlo_calibration.xml import (
     refused,
     write_octets,
 )
+from dlo_calibration.model.action import Action, Hand, NO_ROTATION
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
+from dlo_calibration.model.trial import Goal, Trial
 
 ROOT = 'calibration_request'
 WHAT = 'request'

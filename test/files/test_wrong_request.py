@@ -18,11 +18,12 @@ from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 from wrong_input import mutations
 
-from dlo_calibration import cli, InputError, recording
+from dlo_calibration import cli, InputError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.files import recording
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INITIAL
-from dlo_calibration.session import read_session, session_trials
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)
@@ -262,7 +263,7 @@ def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, co
 WRITER = """
 import os, random, signal, sys, time
 from pathlib import Path
-from dlo_calibration.session import SessionWriter, read_session
+from dlo_calibration.files.session import SessionWriter, read_session
 source = read_session(sys.argv[1]).records
 for turn in range(int(sys.argv[3])):
     folder = Path(sys.argv[2]) / f'{turn:02d}'

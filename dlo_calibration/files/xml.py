@@ -273,7 +273,7 @@ def _short(text: str) -> str:
 
 
 def _schema(name: str) -> Any:
-    with as_file(files('dlo_calibration') / 'schema') as folder:
+    with as_file(files('dlo_calibration') / 'files/schema') as folder:
         return etree.XMLSchema(etree.parse(str(folder / f'{name}.xsd')))
 
 

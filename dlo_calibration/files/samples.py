@@ -14,7 +14,7 @@ from dlo_calibration.errors import InputError
 
 def samples() -> Path:
     """Return the folder of the sample sessions: of the sources, or where they are installed."""
-    beside = Path(__file__).resolve().parents[1] / 'msg_samples'
+    beside = Path(__file__).resolve().parents[2] / 'msg_samples'
     shared = Path('share') / 'dlo_calibration' / 'msg_samples'
     prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
     for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):

@@ -17,13 +17,13 @@ from wire import wire
 
 from dlo_calibration import calibrate, cli, ParameterSpace
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.search import RandomSearch
-from dlo_calibration.session import read_session
 from dlo_calibration.simulation.bullet import BulletSimulator
 
-SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'
+SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
 DOCUMENTS = ('README.md', 'make_yaml.py', 'make_xml.py')
 SESSIONS = sorted(file.parent for file in SAMPLES.glob('*/metadata.yaml'))
 FIELDS = get_typestore(Stores.ROS2_JAZZY).fielddefs

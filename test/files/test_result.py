@@ -15,15 +15,15 @@ from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.description import (
+from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.files.result import (
     Description,
     description_document,
     read_description,
     read_result,
     write_result,
 )
-from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search.random import RandomSearch

@@ -22,6 +22,14 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.recording import (
+    METADATA_FILE,
+    METADATA_KEY,
+    OUR_RECORD,
+    RecordingError,
+    SessionWriter,
+    typestore,
+)
 from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
@@ -33,14 +41,6 @@ from dlo_calibration.messages.codec import (
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.recording import (
-    METADATA_FILE,
-    METADATA_KEY,
-    OUR_RECORD,
-    RecordingError,
-    SessionWriter,
-    typestore,
-)
 
 __all__ = ['Record', 'RecordingError', 'Session', 'SessionWriter', 'decode', 'encode', 'read_session',
            'session_trials']

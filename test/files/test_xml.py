@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.request import GoalRequest, Request, request_of, TrialRequest
+from dlo_calibration.files.xml import MAXIMUM_ELEMENTS, MAXIMUM_SIZE, parse, text_of
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import LiftAndHold
-from dlo_calibration.request import GoalRequest, Request, request_of, TrialRequest
-from dlo_calibration.xml import MAXIMUM_ELEMENTS, MAXIMUM_SIZE, parse, text_of
 
 STRAIGHT = Chain(np.column_stack([np.linspace(0, 0.6, 4), np.zeros(4), np.zeros(4)]))
 REQUEST = Request((TrialRequest('one', STRAIGHT, (LiftAndHold(point=1),), (GoalRequest(STRAIGHT, 2.0),)),),

@@ -11,7 +11,7 @@ import pytest
 from dlo_calibration.calibration.options import declarations
 from dlo_calibration.diagnostics import OUTPUT_TYPES
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def documented():
@@ -61,11 +61,11 @@ def test_the_rope_of_the_readme_runs(tmp_path):
 
     from dlo_calibration.calibration.calibrate import calibrate
     from dlo_calibration.calibration.options import Options
-    from dlo_calibration.description import read_result, write_result
+    from dlo_calibration.files.result import read_result, write_result
+    from dlo_calibration.files.session import read_session, session_trials
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.parameters import ParameterSpace
     from dlo_calibration.search import LeastSquares
-    from dlo_calibration.session import read_session, session_trials
     from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
 
     session = read_session(ROOT / 'msg_samples/object1')

@@ -26,6 +26,7 @@ from ruamel.yaml import YAML
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.session import encode, read_session, RecordingError, session_trials, SessionWriter
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -38,13 +39,12 @@ from dlo_calibration.messages.codec import (
     read,
 )
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.session import encode, read_session, RecordingError, session_trials, SessionWriter
 
 TYPES = bag_types()
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
-SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples'
+SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
 STATUS = 'diagnostic_msgs/msg/DiagnosticArray'
 
 
@@ -477,7 +477,7 @@ def test_killed_process_loses_nothing_that_was_written(tmp_path, session):
     program = f"""
 import os, signal
 from pathlib import Path
-from dlo_calibration.session import SessionWriter, read_session
+from dlo_calibration.files.session import SessionWriter, read_session
 source = read_session({str(session)!r})
 writer = SessionWriter(Path({str(tmp_path)!r}) / 'killed', source.options)
 for record in source.records:

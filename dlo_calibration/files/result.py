@@ -18,11 +18,7 @@ from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration.calibrate import CalibrationResult, ParameterEstimate
 from dlo_calibration.errors import InputError
-from dlo_calibration.inference.confirmation import Confirmation
-from dlo_calibration.model.chain import Chain
-from dlo_calibration.model.parameters import ParameterSpace, SCALE
-from dlo_calibration.model.score import PointErrors
-from dlo_calibration.xml import (
+from dlo_calibration.files.xml import (
     add,
     add_chain,
     add_options,
@@ -37,6 +33,10 @@ from dlo_calibration.xml import (
     text_of,
     write_octets,
 )
+from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.score import PointErrors
 
 ROOT = 'dlo'
 WHAT = 'result file'

@@ -19,8 +19,17 @@ from toy_simulator import ToySimulator
 from dlo_calibration import cli
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.description import read_description, read_result
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.request import (
+    GoalRequest,
+    read_request,
+    Request,
+    request_of,
+    request_trials,
+    TrialRequest,
+    write_request,
+)
+from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import (
@@ -32,17 +41,8 @@ from dlo_calibration.model.named_actions import (
     Release,
     TwoHands,
 )
-from dlo_calibration.request import (
-    GoalRequest,
-    read_request,
-    Request,
-    request_of,
-    request_trials,
-    TrialRequest,
-    write_request,
-)
 
-SAMPLES = Path(__file__).resolve().parents[1] / 'msg_samples' / 'xml'
+SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples' / 'xml'
 REQUESTS = sorted(file for file in SAMPLES.glob('*.xml') if 'calibration_request' in file.read_text(
     encoding='utf-8'))
 ALONG = np.linspace(0, 0.6, 4)
@@ -344,7 +344,7 @@ def test_request_that_cannot_be_used_takes_one_line(command, file):
 
 
 def test_examples_of_the_document_are_what_it_says():
-    text = (SAMPLES.parents[1] / 'doc' / 'formats.md').read_text(encoding='utf-8')
+    text = (SAMPLES.parents[2] / 'doc' / 'formats.md').read_text(encoding='utf-8')
     described, asked = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
     found = request_of(asked.encode())
