@@ -200,7 +200,7 @@ def _note(text: str) -> None:
 
 
 def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    from dlo_calibration.terminal import SearchBar
+    from dlo_calibration.report.terminal import SearchBar
 
     found = _read(chosen, _note)
     trials = _some(found)
@@ -243,7 +243,7 @@ def _validate(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
 
 
 def _plot(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    from dlo_calibration.plot import write_animations, write_pictures
+    from dlo_calibration.report.plot import write_animations, write_pictures
 
     if chosen.animation and chosen.result is None:
         raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
@@ -298,7 +298,7 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
 
 def document(result: CalibrationResult) -> dict[str, Any]:
     """Return what `fit` and `validate` print as JSON."""
-    from dlo_calibration import findings
+    from dlo_calibration.report import sentences
 
     errors = result.errors
     return {
@@ -311,7 +311,7 @@ def document(result: CalibrationResult) -> dict[str, Any]:
         'trials': len(result.trials), 'evaluations': len(result.evaluations),
         'simulations': result.simulations, 'seconds': result.seconds, 'engine': result.engine,
         'search': result.search, 'seed': result.seed, 'stop_reason': result.stop_reason,
-        'warnings': list(result.warnings), **findings.values(result),
+        'warnings': list(result.warnings), **sentences.values(result),
         'confirmation': None if result.confirmation is None else _confirmation(result.confirmation)}
 
 
@@ -341,7 +341,7 @@ def _finite(value: Any) -> Any:
 
 
 def _print_result(result: CalibrationResult, as_json: bool, told: Sequence[str] = ()) -> None:
-    from dlo_calibration import terminal
+    from dlo_calibration.report import terminal
 
     for warning in result.warnings:
         if warning not in told:
@@ -367,7 +367,13 @@ def _make_folder(folder: Path, names: Sequence[str]) -> None:
 def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult,
            make_simulator: SimulatorFactory, should_stop: Callable[[], bool]) -> None:
     """Write the files of `fit`."""
-    from dlo_calibration.report import digests, Origin, repeating_command, write_evaluations, write_report
+    from dlo_calibration.report.page import (
+        digests,
+        Origin,
+        repeating_command,
+        write_evaluations,
+        write_report,
+    )
 
     write_result(folder / RESULT, result, found.options.flat())
     _write_session(folder / SESSION, source, found)
@@ -419,7 +425,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    from dlo_calibration.report import as_flags
+    from dlo_calibration.report.page import as_flags
 
     given = _given(chosen)
 
@@ -442,7 +448,7 @@ def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) ->
 
 
 def _info(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    from dlo_calibration import terminal
+    from dlo_calibration.report import terminal
 
     found = _read(chosen, lambda text: None)
     about = _about(found)

@@ -20,7 +20,6 @@ import sys
 import time
 from typing import Any, Callable, Iterator, Sequence
 
-from dlo_calibration import findings, terminal
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import document, validated
 from dlo_calibration.diagnostics import OUTPUT_TYPES
@@ -29,7 +28,8 @@ from dlo_calibration.files.result import read_result
 from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import read_session, Session, session_trials
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
-from dlo_calibration.picture import session_picture
+from dlo_calibration.report import sentences, terminal
+from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.signals import StopFlag
 
 NODE = '/calibrator'
@@ -87,7 +87,7 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
         *terminal.error_facts(result)[:4], ('evaluations', f'{file.evaluations} in {file.seconds:.1f} s'),
         ('search', f'{file.search}, seed {file.seed}'), ('engine', file.engine),
         ('ended', file.stop_reason)]))
-    for sentence in findings.sentences(result):
+    for sentence in sentences.sentences(result):
         out.print(sentence)
     out.print(f'session and result.xml: {folder}', soft_wrap=True)
     out.print(f'simulated chains on the measured ones: {output / PICTURE}', soft_wrap=True)

@@ -8,13 +8,13 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
-from dlo_calibration import findings
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.parameters import measured
+from dlo_calibration.report import sentences
 
 OUTPUT_TYPES: Mapping[str, str] = {
     'progress': 'diagnostic_msgs/msg/DiagnosticArray',
@@ -84,11 +84,11 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
 
 def _examination(found: CalibrationResult) -> dict[str, Any]:
     """Return what was found around the parameters; empty values where it was not examined."""
-    examined = findings.values(found)
+    examined = sentences.values(found)
     lengths = {f'{key.removesuffix("_m")}_mm': '' if examined[key] is None else 1e3 * examined[key]
                for key in ('cross_validated_error_m', 'default_error_m', 'noise_m', 'residual_std_m')}
     return {**lengths, 'undetermined': '; '.join(found.undetermined),
-            'findings': ' '.join(findings.sentences(found))}
+            'findings': ' '.join(sentences.sentences(found))}
 
 
 def _confirmation(found: Confirmation | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from dlo_calibration.experiment import Outcome, Task
 from dlo_calibration.experiment_summary import complete_runs, Findings, Spread
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
-from dlo_calibration.picture import as_text, blank_figure, DOTS_PER_INCH, MILLIMETRES, unwritable
+from dlo_calibration.report.drawing import as_text, blank_figure, DOTS_PER_INCH, MILLIMETRES, unwritable
 
 UNKNOWN = 'not known to us'
 #: Figures of the paper: of its five objects, by the names of the samples that resemble them.

@@ -32,9 +32,9 @@ from dlo_calibration.experiment import (
 )
 from dlo_calibration.experiment_summary import complete_runs, run_score, summary
 from dlo_calibration.files.samples import samples
-from dlo_calibration.picture import session_picture
+from dlo_calibration.report.drawing import session_picture
+from dlo_calibration.report.terminal import TaskBar
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.terminal import TaskBar
 
 JOURNAL, SCATTER = 'calibrations.jsonl', 'parameters.png'
 RUNS = 20  # the paper's

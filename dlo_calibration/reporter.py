@@ -12,7 +12,7 @@ from typing import Iterator
 
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.worker import SimulatorFactory, sliced_with
-from dlo_calibration.report import Origin, write_report
+from dlo_calibration.report.page import Origin, write_report
 
 PATIENCE = 10.0  # s that the end waits for a page
 

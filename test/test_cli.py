@@ -272,7 +272,8 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 PROGRAM = """
 import pathlib, sys
 from toy_simulator import ToySimulator
-from dlo_calibration import cli, terminal
+from dlo_calibration import cli
+from dlo_calibration.report import terminal
 
 class Bar(terminal.SearchBar):
     def take(self, evaluation):

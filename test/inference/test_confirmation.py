@@ -19,9 +19,9 @@ from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, trial_score
-from dlo_calibration.report import Origin, write_report
+from dlo_calibration.report.page import Origin, write_report
+from dlo_calibration.report.terminal import error_facts
 from dlo_calibration.search.random import RandomSearch
-from dlo_calibration.terminal import error_facts
 
 OPTIONS = Options(evaluations=20, workers=1)
 

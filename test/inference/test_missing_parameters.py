@@ -9,9 +9,9 @@ import pytest
 from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
 
 from dlo_calibration.calibration.calibrate import calibrate, explained
-from dlo_calibration.findings import sentences, values
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.report.sentences import sentences, values
 from dlo_calibration.search import LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
 

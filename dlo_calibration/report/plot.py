@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Callable, Mapping, Sequence
 
-from dlo_calibration.animation import simulated_motion, write_animation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.picture import trial_picture, unwritable
+from dlo_calibration.report.animation import simulated_motion, write_animation
+from dlo_calibration.report.drawing import trial_picture, unwritable
 from dlo_calibration.simulation.protocol import Simulator
 
 

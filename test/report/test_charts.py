@@ -9,7 +9,18 @@ import re
 import numpy as np
 import pytest
 
-from dlo_calibration.charts import BOTTOM, cell_colour, Chart, CROSS, HEIGHT, LEFT, legend, RIGHT, TOP, WIDTH
+from dlo_calibration.report.charts import (
+    BOTTOM,
+    cell_colour,
+    Chart,
+    CROSS,
+    HEIGHT,
+    LEFT,
+    legend,
+    RIGHT,
+    TOP,
+    WIDTH,
+)
 
 RED = '#f00'
 

@@ -11,8 +11,8 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
-from dlo_calibration.findings import interval_text, physical_text, plain, sentences
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
+from dlo_calibration.report.sentences import interval_text, physical_text, plain, sentences
 
 
 @pytest.fixture(scope='module')

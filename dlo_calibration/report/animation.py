@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.picture import (
+from dlo_calibration.report.drawing import (
     add_legend,
     as_text,
     blank_figure,

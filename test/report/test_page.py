@@ -24,7 +24,7 @@ from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.slices import cut
-from dlo_calibration.report import digests, MOST_TRIALS, Origin, repeating_command, write_report
+from dlo_calibration.report.page import digests, MOST_TRIALS, Origin, repeating_command, write_report
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 QUIET = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',

@@ -67,7 +67,7 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
 
 
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
-    monkeypatch.setattr('dlo_calibration.animation.FRAME_RATE', 2)
+    monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 2)
     code, output, _ = run('plot', session, result, '--animation', '--output', tmp_path / 'films', '--json')
     assert code == 0
     assert written(tmp_path / 'films') == ['trial_1.gif', 'trial_1.png', 'trial_2.gif', 'trial_2.png']

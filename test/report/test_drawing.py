@@ -12,9 +12,9 @@ import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
-from dlo_calibration.animation import densely, MOST_FRAMES, simulated_motion, write_animation
 from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.picture import horizontal_direction, session_picture, trial_picture
+from dlo_calibration.report.animation import densely, MOST_FRAMES, simulated_motion, write_animation
+from dlo_calibration.report.drawing import horizontal_direction, session_picture, trial_picture
 from dlo_calibration.simulation.protocol import Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling
 
@@ -172,7 +172,7 @@ def test_long_trial_has_no_more_frames_than_a_viewer_can_bear():
 
 
 def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
-    monkeypatch.setattr('dlo_calibration.animation.FRAME_RATE', 5)
+    monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 5)
     trial, = toy_trials(1)
     write_animation(trial, simulated_motion(trial, Following(), {}), tmp_path / 'one.gif')
     gif = Image.open(tmp_path / 'one.gif')

@@ -17,22 +17,22 @@ from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration import findings
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.figures import (
+from dlo_calibration.inference.slices import Slices
+from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
+from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
+from dlo_calibration.report import sentences
+from dlo_calibration.report.figures import (
     convergence_figure,
     correlation_table,
     line_figure,
     plane_figure,
     trial_figure,
 )
-from dlo_calibration.inference.slices import Slices
-from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.model.parameters import BY_NAME
-from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
-from dlo_calibration.terminal import error_facts
+from dlo_calibration.report.terminal import error_facts
 
 MOST_TRIALS = 12  # that are drawn
 VERSIONS = ('dlo_calibration', 'numpy', 'scipy', 'numba', 'pybullet')
@@ -176,7 +176,7 @@ def _summary(result: CalibrationResult, origin: Origin) -> str:
               mm long. It was observed in {_count(len(result.trials), 'trial')}:
               where it was, what the hands did, and where it was then. The values below make a simulated
               DLO end where the real one did.""")
-        + '<ul>' + ''.join(f'<li>{escape(_unit(text))}</li>' for text in findings.sentences(result)) + '</ul>'
+        + '<ul>' + ''.join(f'<li>{escape(_unit(text))}</li>' for text in sentences.sentences(result)) + '</ul>'
         + (f'<div class="warnings"><h3>Warnings</h3><ul>{warned}</ul></div>' if warned else ''))
 
 
@@ -184,8 +184,8 @@ def _parameters(result: CalibrationResult) -> str:
     head = ('parameter', 'value', '90 % interval', 'verdict', 'from 0 to 100', '90 % interval')
     rows = []
     for name, p in result.parameters.items():
-        value = findings.physical_text(p.physical_value, p.physical_unit)
-        interval = findings.interval_text(p.physical_lower, p.physical_upper, p.physical_unit)
+        value = sentences.physical_text(p.physical_value, p.physical_unit)
+        interval = sentences.interval_text(p.physical_lower, p.physical_upper, p.physical_unit)
         note = f'<br><small>{escape(p.note)}</small>' if p.note else ''
         rows.append(
             f'<tr><th scope="row">{escape(name)}<br><small>{escape(BY_NAME[name].quantity)}</small></th>'
@@ -205,7 +205,7 @@ def _fit(result: CalibrationResult) -> str:
     if found is not None:
         rows += [('a trial that is left out of the fit, predicted from the others', found.cross_validated),
                  ('the default parameters', found.default_error),
-                 ('the noise of the measured points alone', found.noise * findings.MEAN_DISTANCE)]
+                 ('the noise of the measured points alone', found.noise * sentences.MEAN_DISTANCE)]
         if found.regular:
             rows.append(('how far simulated points may lie elsewhere, as the parameters are not known '
                          'exactly (one standard deviation)', float(found.band.mean())))

@@ -11,14 +11,14 @@ from typing import Iterator
 import numpy as np
 
 from dlo_calibration.calibration.calibrate import CalibrationResult
-from dlo_calibration.charts import cell_colour, Chart, CROSS, legend, RING, SQUARE, TRIANGLE
-from dlo_calibration.findings import MEAN_DISTANCE
 from dlo_calibration.inference.slices import Line, Plane, Slices
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.picture import horizontal_direction, INSTANT_COLOURS
+from dlo_calibration.report.charts import cell_colour, Chart, CROSS, legend, RING, SQUARE, TRIANGLE
+from dlo_calibration.report.drawing import horizontal_direction, INSTANT_COLOURS
+from dlo_calibration.report.sentences import MEAN_DISTANCE
 
 MILLIMETRES = 1e3
 MEASURED, SIMULATED, BEFORE, BLUE, RED, GREY = '#111', '#e8710a', '#b4b4b4', '#2b6cb0', '#c62828', '#777'

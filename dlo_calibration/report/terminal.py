@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from dlo_calibration import findings
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
+from dlo_calibration.report import sentences
 
 WIDTH = 110  # columns where the output is not a terminal
 
@@ -162,7 +162,7 @@ def print_result(result: CalibrationResult, parameters: Mapping[str, Mapping[str
     out = console(stream)
     out.print(parameter_table(parameters))
     out.print(facts_table('fit', error_facts(result)))
-    for sentence in findings.sentences(result):
+    for sentence in sentences.sentences(result):
         out.print(escape(sentence))
 
 
