@@ -15,14 +15,15 @@ import sys
 import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
-from dlo_calibration import experiment_report, experiment_verb
+from dlo_calibration import experiment_verb
 from dlo_calibration.calibration.calibrate import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
-from dlo_calibration.experiment import Observed
+from dlo_calibration.experiment import tables
+from dlo_calibration.experiment.study import Observed
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import read_request, request_trials
 from dlo_calibration.files.result import Description, read_result, write_result
@@ -441,9 +442,9 @@ def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) ->
     if account is None:
         raise KeyboardInterrupt
     if chosen.json:
-        _print_json(experiment_report.document(account), sys.stdout)
+        _print_json(tables.document(account), sys.stdout)
     else:
-        sys.stdout.write(experiment_report.markdown(account))
+        sys.stdout.write(tables.markdown(account))
     return 0 if account.complete else INTERRUPTED
 
 

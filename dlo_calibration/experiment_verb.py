@@ -15,12 +15,12 @@ import shlex
 import time
 from typing import Any, Callable, Iterator, Mapping, Protocol, Sequence, TextIO
 
-from dlo_calibration import experiment_report as report
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
-from dlo_calibration.experiment import (
+from dlo_calibration.experiment import tables as report
+from dlo_calibration.experiment.study import (
     Journal,
     judged_chains,
     Observed,
@@ -30,7 +30,7 @@ from dlo_calibration.experiment import (
     Task,
     tasks,
 )
-from dlo_calibration.experiment_summary import complete_runs, run_score, summary
+from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.files.samples import samples
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.terminal import TaskBar

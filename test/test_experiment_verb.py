@@ -54,7 +54,7 @@ def run(capsys):
 def undrawn(monkeypatch):
     """Draw no pictures, which take longer than all the rest."""
     monkeypatch.setattr('dlo_calibration.experiment_verb.session_picture', lambda *_: None)
-    monkeypatch.setattr('dlo_calibration.experiment_report.scatter_picture', lambda *_: None)
+    monkeypatch.setattr('dlo_calibration.experiment.tables.scatter_picture', lambda *_: None)
 
 
 def timeless(text):

@@ -13,7 +13,8 @@ import pytest
 from test_experiment_summary import run
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.experiment_report import (
+from dlo_calibration.experiment.summary import summary
+from dlo_calibration.experiment.tables import (
     Account,
     consistency_csv,
     document,
@@ -22,7 +23,6 @@ from dlo_calibration.experiment_report import (
     scatter_picture,
     validity_csv,
 )
-from dlo_calibration.experiment_summary import summary
 
 DONE = [*run(1, 60.0, (10.0, 50.0)), *run(2, 70.0, (40.0, 80.0)), *run(3, 80.0, (20.0, 40.0))]
 FINDINGS = summary(DONE)

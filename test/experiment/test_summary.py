@@ -8,8 +8,8 @@ import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.experiment import Judgement, Observed, Outcome, Subject, Task
-from dlo_calibration.experiment_summary import Spread, summary
+from dlo_calibration.experiment.study import Judgement, Observed, Outcome, Subject, Task
+from dlo_calibration.experiment.summary import Spread, summary
 
 OPTIONS = Options.of({'calibrate': ['friction', 'elasticity']})
 ROPE = Subject('rope', Observed(tuple(toy_trials(2)), OPTIONS), (0, 1))

@@ -16,7 +16,7 @@ from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import hints
 from dlo_calibration.errors import InputError
-from dlo_calibration.experiment import (
+from dlo_calibration.experiment.study import (
     Journal,
     judged_chains,
     Judgement,
