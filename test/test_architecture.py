@@ -117,9 +117,9 @@ def test_the_compiled_engine_loads_no_other_slow_library():
     program = f"""
 import sys
 from {PACKAGE} import ParameterSpace
-from {PACKAGE}.compiled import CompiledSimulator
-from {PACKAGE}.config import Options
-from {PACKAGE}.session import read_session, session_trials
+from {PACKAGE}.simulation.compiled import CompiledSimulator
+from {PACKAGE}.calibration.options import Options
+from {PACKAGE}.files.session import read_session, session_trials
 trials, _ = session_trials(read_session('msg_samples/object1'), Options())
 CompiledSimulator().simulate(trials[0], ParameterSpace().physical({{}}, 0.6))
 print(*sys.modules)

@@ -176,7 +176,8 @@ def _summary(result: CalibrationResult, origin: Origin) -> str:
               mm long. It was observed in {_count(len(result.trials), 'trial')}:
               where it was, what the hands did, and where it was then. The values below make a simulated
               DLO end where the real one did.""")
-        + '<ul>' + ''.join(f'<li>{escape(_unit(text))}</li>' for text in sentences.sentences(result)) + '</ul>'
+        + '<ul>' + ''.join(f'<li>{escape(_unit(text))}</li>' for text in sentences.sentences(result))
+        + '</ul>'
         + (f'<div class="warnings"><h3>Warnings</h3><ul>{warned}</ul></div>' if warned else ''))
 
 

@@ -10,7 +10,7 @@ from io import StringIO
 import numpy as np
 from PIL import Image
 import pytest
-from test_experiment_summary import run
+from test_summary import run
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment.summary import summary
