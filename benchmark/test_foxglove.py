@@ -13,9 +13,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
-from dlo_calibration.diagnostics import OUTPUT_TYPES, status
 from dlo_calibration.files.session import encode, read_session, SessionWriter
 from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, status
 
 SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
 HERE = Path(__file__).parent / 'foxglove'

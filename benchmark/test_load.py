@@ -15,8 +15,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from dlo_calibration import demo, node  # noqa: E402 - where there is a ROS
+from dlo_calibration import demo
 from dlo_calibration.files.session import read_session  # noqa: E402
+from dlo_calibration.ros import calibrator_node  # noqa: E402 - where there is a ROS
 from dlo_calibration.signals import StopFlag  # noqa: E402
 
 SAMPLE = Path(__file__).resolve().parent.parent / 'msg_samples' / 'object1'
@@ -25,22 +26,22 @@ PERIOD = 0.02  # s of the node's timer, and between two calls
 CALLS = 500
 
 
-class Watched(node.CalibratorNode):
+class Watched(calibrator_node.CalibratorNode):
     """The node, with a timer that notes when it fires."""
 
     fired: list[float] = []
 
     def __init__(self, *args, **keywords):
         super().__init__(*args, **keywords)
-        clock = node.Clock(clock_type=node.ClockType.STEADY_TIME)
+        clock = calibrator_node.Clock(clock_type=calibrator_node.ClockType.STEADY_TIME)
         self.create_timer(PERIOD, lambda: self.fired.append(time.monotonic()), clock=clock)
 
 
 def watched_node(file, *args):
     """Be the node until Ctrl-C, then write when the timer fired."""
-    node.CalibratorNode = Watched
+    calibrator_node.CalibratorNode = Watched
     with StopFlag() as stop:
-        node.spin(args, stop)
+        calibrator_node.spin(args, stop)
     np.savetxt(file, Watched.fired)
 
 

@@ -18,8 +18,8 @@ SLOW = ('numpy', 'scipy', 'scipy.spatial', 'scipy.optimize', 'matplotlib', 'numb
 COMMANDS = {
     'dlo-calibration --help': ('dlo_calibration', '--help'),
     'dlo-calibration info SESSION': ('dlo_calibration', 'info', str(SAMPLES / 'object1')),
-    'calibrator --help': ('dlo_calibration.calibrator', '--help'),
-    'calibrator, until it is ready': ('dlo_calibration.calibrator',),
+    'calibrator --help': ('dlo_calibration.ros.calibrator', '--help'),
+    'calibrator, until it is ready': ('dlo_calibration.ros.calibrator',),
 }
 READY = 'collecting trials'  # says the node
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}

@@ -22,7 +22,6 @@ from typing import Any, Callable, Iterator, Sequence
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import document, validated
-from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.samples import samples
@@ -30,6 +29,7 @@ from dlo_calibration.files.session import read_session, Session, session_trials
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.report import sentences, terminal
 from dlo_calibration.report.drawing import session_picture
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.signals import StopFlag
 
 NODE = '/calibrator'
@@ -105,7 +105,7 @@ def _show(robot: Any, bar: terminal.SearchBar) -> bool:
 @contextmanager
 def _node(options: dict[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Start the node as a process of its own, and end it as Ctrl-C would."""
-    command = [sys.executable, '-m', 'dlo_calibration.calibrator', '--ros-args']
+    command = [sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args']
     for name, value in options.items():
         command += ['-p', f'{name}:={json.dumps(value)}']  # JSON is YAML, which ROS expects
     with log.open('wb') as stream:

@@ -24,7 +24,6 @@ from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.diagnostics import status
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.session import encode, read_session, RecordingError, session_trials, SessionWriter
 from dlo_calibration.messages.codec import (
@@ -39,6 +38,7 @@ from dlo_calibration.messages.codec import (
     read,
 )
 from dlo_calibration.model.chain import Chain
+from dlo_calibration.ros.diagnostics import status
 
 TYPES = bag_types()
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -10,7 +10,7 @@ import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
 
-from dlo_calibration import cli, diagnostics, Rollout, SimulationError
+from dlo_calibration import cli, Rollout, SimulationError
 from dlo_calibration.calibration.calibrate import calibrate, confirmed
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
@@ -21,6 +21,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, trial_score
 from dlo_calibration.report.page import Origin, write_report
 from dlo_calibration.report.terminal import error_facts
+from dlo_calibration.ros import diagnostics
 from dlo_calibration.search.random import RandomSearch
 
 OPTIONS = Options(evaluations=20, workers=1)

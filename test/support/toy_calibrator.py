@@ -17,10 +17,10 @@ def make_toy(seconds, options):
 
 
 def main():
-    """Run it, as `dlo_calibration.calibrator` runs the real one."""
+    """Run it, as `dlo_calibration.ros.calibrator` runs the real one."""
     stop = StopFlag()
     stop.listen()
-    from dlo_calibration.node import spin
+    from dlo_calibration.ros.calibrator_node import spin
 
     code = spin(sys.argv[2:], stop, functools.partial(make_toy, float(sys.argv[1])))
     stop.ignore()

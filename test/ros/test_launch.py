@@ -15,13 +15,13 @@ from types import ModuleType, SimpleNamespace
 import pytest
 from ruamel.yaml import YAML
 
-from dlo_calibration import diagnostics
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
+from dlo_calibration.ros import diagnostics
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LAUNCH_FILE = ROOT / 'launch' / 'calibrator.launch.py'
 RVIZ, FOXGLOVE = ROOT / 'config' / 'calibrator.rviz', ROOT / 'config' / 'foxglove_layout.json'
 TOPICS = {f'/calibrator/{name}': kind for name, kind in {**INPUT_TYPES, **OUTPUT_TYPES}.items()}

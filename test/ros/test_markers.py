@@ -13,10 +13,10 @@ from toy_simulator import toy_trial, ToySimulator
 from wire import wire
 
 from dlo_calibration.calibration.calibrate import calibrate
-from dlo_calibration.markers import error_colour, markers, MOST_POINTS
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, INSTANTS
+from dlo_calibration.ros.markers import error_colour, markers, MOST_POINTS
 from dlo_calibration.search import RandomSearch
 
 STAMP = 12_500_000_000

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from wire import wire
 
-from dlo_calibration import diagnostics
 from dlo_calibration.calibration.calibrate import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.trial_information import Gain
@@ -18,6 +17,7 @@ from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.ros import diagnostics
 
 STAMP = 12_500_000_000
 

@@ -34,7 +34,7 @@ def main(args: Sequence[str] | None = None) -> int:
     stop = StopFlag()
     stop.listen()
     try:
-        from dlo_calibration.node import spin
+        from dlo_calibration.ros.calibrator_node import spin
 
         return spin(args, stop)
     except ImportError as error:

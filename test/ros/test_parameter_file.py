@@ -11,17 +11,17 @@ import pytest
 from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.parameter_file import parameter_file
+from dlo_calibration.ros.parameter_file import parameter_file
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / 'config' / 'calibrator.yaml'
 
 
 def test_file_is_what_the_documented_command_makes():
-    done = subprocess.run([sys.executable, '-m', 'dlo_calibration.parameter_file'], cwd=ROOT, check=True,
+    done = subprocess.run([sys.executable, '-m', 'dlo_calibration.ros.parameter_file'], cwd=ROOT, check=True,
                           capture_output=True, text=True)
     assert done.stdout == FILE.read_text(encoding='utf-8'), \
-        'make it again: python -m dlo_calibration.parameter_file > config/calibrator.yaml'
+        'make it again: python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml'
 
 
 def test_file_has_every_parameter_with_its_default():
@@ -62,7 +62,7 @@ def test_node_starts_with_the_file_and_takes_what_was_changed_in_it(ros_environm
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
 
-    from dlo_calibration.node import CalibratorNode
+    from dlo_calibration.ros.calibrator_node import CalibratorNode
 
     text = FILE.read_text(encoding='utf-8').replace('output_directory: "."',
                                                     f'output_directory: "{tmp_path}"')

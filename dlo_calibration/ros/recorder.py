@@ -16,7 +16,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.report.page import Origin, repeating_command, write_evaluations
-from dlo_calibration.reporter import Reporter
+from dlo_calibration.ros.report_writer import Reporter
 
 
 class Recorder:

@@ -22,10 +22,10 @@ from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import cli, InputError
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.diagnostics import OUTPUT_TYPES, result_values
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
@@ -41,7 +41,7 @@ from rclpy.signals import SignalHandlerOptions  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
-from dlo_calibration.node import CalibratorNode  # noqa: E402
+from dlo_calibration.ros.calibrator_node import CalibratorNode  # noqa: E402
 
 PATIENCE = 60.0  # s
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -582,7 +582,7 @@ def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_pa
     program = (
         'import sys, pathlib; from dlo_calibration.signals import StopFlag; '
         f'stop = StopFlag(); stop.listen(); pathlib.Path({str(marker)!r}).touch(); '
-        'from dlo_calibration.node import spin; '
+        'from dlo_calibration.ros.calibrator_node import spin; '
         'code = spin(sys.argv[1:], stop); stop.ignore(); sys.exit(code)')
     process = subprocess.Popen(
         [sys.executable, '-c', program, '--ros-args', '-p', f'output_directory:={tmp_path}'], text=True,

@@ -10,12 +10,12 @@ from typing import Any, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.calibrate import CalibrationResult
-from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9  # visualization_msgs/Marker
 ADD, DELETE_ALL = 0, 3

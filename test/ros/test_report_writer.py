@@ -12,7 +12,7 @@ from toy_simulator import ToySimulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.report.page import Origin
-from dlo_calibration.reporter import Reporter
+from dlo_calibration.ros.report_writer import Reporter
 
 OPTIONS = Options.of({'workers': 1, 'evaluations': 20})
 ORIGIN = Origin('session', 'a command', OPTIONS)

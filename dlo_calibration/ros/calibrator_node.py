@@ -34,23 +34,23 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from dlo_calibration import diagnostics
 from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.live_information import Appraiser
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
-from dlo_calibration.diagnostics import OUTPUT_TYPES
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
 from dlo_calibration.inference.trial_information import Gain
-from dlo_calibration.markers import markers
 from dlo_calibration.messages import codec
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.messages.collector import KEPT, TrialCollector
-from dlo_calibration.options_node import OptionsNode
-from dlo_calibration.recorder import Recorder
+from dlo_calibration.ros import diagnostics
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
+from dlo_calibration.ros.markers import markers
+from dlo_calibration.ros.parameters import OptionsNode
+from dlo_calibration.ros.recorder import Recorder
 
 LOG = logging.getLogger('dlo_calibration')  # notices of the rest of the package
 DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains

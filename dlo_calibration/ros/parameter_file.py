@@ -6,7 +6,7 @@ Parameter file: ``config/calibrator.yaml``, every parameter of the node with a c
 
 After a change of the declarations, make it again with
 
-    python -m dlo_calibration.parameter_file > config/calibrator.yaml
+    python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ values there (lines that you leave out keep the default), and give the copy to t
 
 An unknown name or a value out of range is refused when the node starts.
 
-This file is made from the declarations: python -m dlo_calibration.parameter_file > config/calibrator.yaml
+This file is made from the declarations: python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
 WIDTH = 100  # columns
 INDENT = '    '
