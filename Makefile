@@ -39,7 +39,7 @@ help:
 	END
 
 demo: $(STAMP)
-	@$(PYTHON) -m dlo_calibration.demo
+	@$(PYTHON) -m dlo_calibration.cli.demo
 
 experiment: $(STAMP)
 	@$(PYTHON) -m dlo_calibration experiment

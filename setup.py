@@ -83,8 +83,8 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'calibrator = {NAME}.calibrator:main',
-            f'dlo-calibration = {NAME}.cli:main',
+            f'calibrator = {NAME}.ros.calibrator:main',
+            f'dlo-calibration = {NAME}.cli.main:main',
         ],
     },
 )

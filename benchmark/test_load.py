@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from dlo_calibration import demo
+from dlo_calibration.cli import demo
 from dlo_calibration.files.session import read_session  # noqa: E402
 from dlo_calibration.ros import calibrator_node  # noqa: E402 - where there is a ROS
 from dlo_calibration.signals import StopFlag  # noqa: E402

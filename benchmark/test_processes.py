@@ -90,7 +90,7 @@ def test_processes(benchmark, engine, processes):
 
 PROGRAM = """
 import json, sys, time
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 marks = {'imports': time.time()}
 calibrate_with = cli.calibrate_with
 def watched(trials, options, make_simulator, on_evaluation, *rest):

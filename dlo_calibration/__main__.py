@@ -5,7 +5,7 @@
 
 import sys
 
-from dlo_calibration.cli import main
+from dlo_calibration.cli.main import main
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -19,7 +19,7 @@ import pytest
 from toy_simulator import ToySimulator
 from wire import SOURCES
 
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'dlo_calibration'

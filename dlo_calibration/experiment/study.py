@@ -33,10 +33,8 @@ from dlo_calibration.model.trial import Trial
 
 #: Options that change nothing in what a calibration finds.
 WITHOUT_EFFECT = ('workers', 'scheduler', 'start_after_trials', 'output_directory', 'record')
-#: Modules that only show what others found: a change there makes no calibration obsolete.
-SHOWING = ('animation', 'charts', 'cli', 'demo', 'experiment_report', 'experiment_summary', 'experiment_verb',
-           'figures', 'findings', 'markers', 'node', 'options_node', 'picture', 'plot', 'recorder', 'report',
-           'reporter', 'slices', 'terminal')
+#: Rooms that only show what others found: a change there makes no calibration obsolete.
+SHOWING = ('cli', 'report', 'ros')
 
 
 @dataclass(frozen=True)
@@ -307,8 +305,8 @@ def _plain(value: Any) -> Any:
 def _sources() -> str:
     """Return a digest of the program: another one may find something else."""
     digest = hashlib.sha256()
-    folder = Path(__file__).parent
+    folder = Path(__file__).parents[1]
     for file in sorted(folder.rglob('*.py')):
-        if file.stem not in SHOWING:
+        if file.relative_to(folder).parts[0] not in SHOWING:
             digest.update(f'{file.relative_to(folder)}\n'.encode() + file.read_bytes())
     return digest.hexdigest()

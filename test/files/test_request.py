@@ -16,9 +16,9 @@ import pytest
 from toy_messages import toy_trials
 from toy_simulator import ToySimulator
 
-from dlo_calibration import cli
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.request import (
     GoalRequest,

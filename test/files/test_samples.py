@@ -15,8 +15,9 @@ from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
 from wire import wire
 
-from dlo_calibration import calibrate, cli, ParameterSpace
+from dlo_calibration import calibrate, ParameterSpace
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.cli import main as cli
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector

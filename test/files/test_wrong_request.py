@@ -18,9 +18,10 @@ from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 from wrong_input import mutations
 
-from dlo_calibration import cli, InputError
+from dlo_calibration import InputError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.cli import main as cli
 from dlo_calibration.files import recording
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INITIAL

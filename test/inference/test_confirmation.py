@@ -10,10 +10,11 @@ import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
 
-from dlo_calibration import cli, Rollout, SimulationError
+from dlo_calibration import Rollout, SimulationError
 from dlo_calibration.calibration.calibrate import calibrate, confirmed
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages.codec import bag_types

@@ -11,7 +11,7 @@ import pytest
 from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 from dlo_calibration.messages.codec import bag_types
 
 

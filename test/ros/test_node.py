@@ -20,8 +20,9 @@ import toy_calibrator
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import Deadly, ToySimulator
 
-from dlo_calibration import cli, InputError
+from dlo_calibration import InputError
 from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types

@@ -21,9 +21,9 @@ import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import Deadly, ToySimulator
 
-from dlo_calibration import cli
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
@@ -109,7 +109,7 @@ def test_correlations_are_between_the_parameters_by_name(run, session):
 
 
 def test_every_key_of_the_document_is_documented():
-    text = (Path(__file__).parents[1] / 'doc/messages.md').read_text(encoding='utf-8')
+    text = (Path(__file__).parents[2] / 'doc/messages.md').read_text(encoding='utf-8')
     assert {key for key in FIT_KEYS | PARAMETER_KEYS if f'`{key}`' not in text} == set()
 
 
@@ -272,7 +272,7 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 PROGRAM = """
 import pathlib, sys
 from toy_simulator import ToySimulator
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 from dlo_calibration.report import terminal
 
 class Bar(terminal.SearchBar):

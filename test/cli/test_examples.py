@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 
 from test_node import child, ended  # noqa: E402
 
-EXAMPLES = Path(__file__).resolve().parents[1] / 'examples'
+EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 PATIENCE = 60.0  # s
 
 

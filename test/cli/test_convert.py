@@ -13,7 +13,7 @@ import pytest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def load_script():

@@ -15,11 +15,11 @@ import sys
 import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
-from dlo_calibration import experiment_verb
 from dlo_calibration.calibration.calibrate import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
+from dlo_calibration.cli import experiment
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.experiment import tables
@@ -87,8 +87,8 @@ def _parser() -> argparse.ArgumentParser:
     plot = verb('plot', _plot, 'draw a picture of each trial: measured, and simulated with a result')
     experiment = verb('experiment', _experiment,
                       "repeat the paper's experiment: how consistent found parameters are, and how valid")
-    experiment_verb.add_arguments(experiment)
-    _add_options(experiment, without=experiment_verb.NOT_AN_OPTION)
+    experiment.add_arguments(experiment)
+    _add_options(experiment, without=experiment.NOT_AN_OPTION)
     for added in (fit, validate, plot, info):
         added.add_argument('session', metavar='SESSION', type=Path,
                            help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
@@ -436,9 +436,9 @@ def _experiment(chosen: argparse.Namespace, make_simulator: SimulatorFactory) ->
         return Observed(_some(found), found.options)
 
     flags = [flag for name, value in given.items() for flag in as_flags(name, value)]
-    plan = experiment_verb.planned(chosen, given, [PROGRAM, 'experiment'], flags, observe)
+    plan = experiment.planned(chosen, given, [PROGRAM, 'experiment'], flags, observe)
     with StopFlag() as stop:
-        account = experiment_verb.act(plan, chosen.output, make_simulator, stop, _note, sys.stderr)
+        account = experiment.act(plan, chosen.output, make_simulator, stop, _note, sys.stderr)
     if account is None:
         raise KeyboardInterrupt
     if chosen.json:

@@ -4,7 +4,7 @@
 """
 The demo: the real node, a sample session sent to it over the graph, a result and a picture.
 
-`python -m dlo_calibration.demo [--output DIR]`; this process stands for the robot.
+`python -m dlo_calibration.cli.demo [--output DIR]`; this process stands for the robot.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from typing import Any, Callable, Iterator, Sequence
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli import document, validated
+from dlo_calibration.cli.main import document, validated
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.samples import samples

@@ -12,7 +12,7 @@ import time
 from processes import children
 import pytest
 
-from dlo_calibration.demo import samples
+from dlo_calibration.cli.demo import samples
 from dlo_calibration.files.session import read_session
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
@@ -23,7 +23,7 @@ PATIENCE = 120.0
 
 def demo(environment, *arguments):
     return subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration.demo', *arguments], text=True, stdout=subprocess.PIPE,
+        [sys.executable, '-m', 'dlo_calibration.cli.demo', *arguments], text=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)})
 
 

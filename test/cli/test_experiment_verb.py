@@ -19,7 +19,7 @@ import pytest
 from toy_calibrator import make_toy
 from toy_messages import session_messages, TRUTH, write_session
 
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 from dlo_calibration.files.samples import samples
 from dlo_calibration.messages.codec import bag_types
 
@@ -53,7 +53,7 @@ def run(capsys):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Draw no pictures, which take longer than all the rest."""
-    monkeypatch.setattr('dlo_calibration.experiment_verb.session_picture', lambda *_: None)
+    monkeypatch.setattr('dlo_calibration.cli.experiment.session_picture', lambda *_: None)
     monkeypatch.setattr('dlo_calibration.experiment.tables.scatter_picture', lambda *_: None)
 
 
@@ -166,7 +166,7 @@ PROGRAM = """
 import functools
 import sys
 from toy_calibrator import make_toy
-from dlo_calibration import cli
+from dlo_calibration.cli import main as cli
 
 if __name__ == '__main__':
     sys.exit(cli.main(sys.argv[2:], functools.partial(make_toy, float(sys.argv[1]))))
