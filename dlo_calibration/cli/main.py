@@ -85,10 +85,10 @@ def _parser() -> argparse.ArgumentParser:
     validate.add_argument('result', metavar='RESULT.xml', type=Path)
     info = verb('info', _info, 'say what is in a session')
     plot = verb('plot', _plot, 'draw a picture of each trial: measured, and simulated with a result')
-    experiment = verb('experiment', _experiment,
-                      "repeat the paper's experiment: how consistent found parameters are, and how valid")
-    experiment.add_arguments(experiment)
-    _add_options(experiment, without=experiment.NOT_AN_OPTION)
+    repeated = verb('experiment', _experiment,
+                    "repeat the paper's experiment: how consistent found parameters are, and how valid")
+    experiment.add_arguments(repeated)
+    _add_options(repeated, without=experiment.NOT_AN_OPTION)
     for added in (fit, validate, plot, info):
         added.add_argument('session', metavar='SESSION', type=Path,
                            help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
