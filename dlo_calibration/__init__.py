@@ -12,7 +12,8 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dlo_calibration.calibration.calibrate import calibrate, CalibrationResult
+    from dlo_calibration.calibration.calibrate import calibrate
+    from dlo_calibration.calibration.result import CalibrationResult
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
     from dlo_calibration.evaluation.evaluation import Evaluation
     from dlo_calibration.model.action import Action, Hand
@@ -29,7 +30,8 @@ __all__ = [
 
 _HOMES = {
     'model.action': ('Action', 'Hand'),
-    'calibration.calibrate': ('calibrate', 'CalibrationResult'),
+    'calibration.calibrate': ('calibrate',),
+    'calibration.result': ('CalibrationResult',),
     'model.chain': ('Chain',),
     'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
     'evaluation.evaluation': ('Evaluation',),

@@ -6,30 +6,32 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 import time
-from typing import Callable, Mapping, Sequence
+from typing import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.calibration.result import (
+    CalibrationResult,
+    estimates,
+    ParameterEstimate,
+    simulated_chains,
+)
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere, mean_length
-from dlo_calibration.inference.advice import Advice, advise
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere
+from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.examination import Examination, examine
-from dlo_calibration.inference.missing_parameters import Explanation, explanations
+from dlo_calibration.inference.missing_parameters import explanations
 from dlo_calibration.inference.uncertainty import (
-    IDENTIFIABLE,
-    INVOLVED,
     MODEL_ERROR,
     spread_of_best,
-    Uncertainty,
 )
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.parameters import ParameterSpace, SCALE
-from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 from dlo_calibration.search import Observation, Search
@@ -41,103 +43,6 @@ STOPPED = 'stopped on request'
 UNLIKELY = 2.71  # chi-square, one degree of freedom, that 10 % exceed
 FURTHEST = 0.1  # that excited parameters follow those that are set to their default, in the unit cube
 STARTS = 16  # initial chains that are simulated with other noise, over all trials
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """
-    One found parameter.
-
-    `value`, `std`, `lower`, `upper` are on the 0..100 scale; the others are the
-    same in `physical_unit`; the interval is one of 90 %.  `identifiable` is False
-    where the trials could not tell its value.
-
-    :param verdict: identifiable, weak, or not identifiable; see `uncertainty`.
-    :param note: what else is to be known, in words; empty where nothing is.
-    """
-
-    name: str
-    value: float
-    std: float
-    lower: float
-    upper: float
-    physical_value: float
-    physical_lower: float
-    physical_upper: float
-    physical_unit: str
-    identifiable: bool
-    verdict: str = ''
-    note: str = ''
-
-
-@dataclass(frozen=True)
-class CalibrationResult:
-    """
-    What a calibration found, and how.
-
-    :param chains: (g, n, 3) [m] the simulated goals of each trial.
-    :param examination: of the surroundings of what was found; None where there was no time for it.
-    :param advice: which action to observe next; None where none would help, or it was not asked for.
-    :param explanations: what more of the object would explain of what the fit leaves over; empty where
-        that is noise, or it was not asked for.
-    """
-
-    space: ParameterSpace
-    parameters: Mapping[str, ParameterEstimate]
-    best: Evaluation
-    trials: tuple[Trial, ...]
-    chains: tuple[Floats, ...]
-    evaluations: tuple[Evaluation, ...]
-    seconds: float
-    search: str
-    engine: str
-    stop_reason: str
-    seed: int | None = None
-    warnings: tuple[str, ...] = ()
-    confirmation: Confirmation | None = None
-    examination: Examination | None = None
-    advice: Advice | None = None
-    explanations: tuple[Explanation, ...] = ()
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Found parameters on the 0..100 scale, by name."""
-        return {name: estimate.value for name, estimate in self.parameters.items()}
-
-    @property
-    def std(self) -> Floats:
-        """(d,) standard deviations of the found values, in the unit cube."""
-        return np.array([estimate.std for estimate in self.parameters.values()]) / SCALE
-
-    @property
-    def errors(self) -> PointErrors:
-        """Point errors of the best evaluation."""
-        assert self.best.errors is not None
-        return self.best.errors
-
-    @property
-    def length(self) -> float:
-        """Mean length of the DLO over the trials [m]."""
-        return mean_length(self.trials)
-
-    @property
-    def simulations(self) -> int:
-        """Rollouts that were simulated, by the search and by the examination."""
-        examined = 0 if self.examination is None else self.examination.evaluations
-        return examined * len(self.trials) + sum(
-            len(self.trials) - evaluation.skipped for evaluation in self.evaluations)
-
-    @property
-    def undetermined(self) -> tuple[str, ...]:
-        """Combinations of parameters that the trials leave open, in words."""
-        if self.examination is None or not self.examination.regular:
-            return ()
-        return tuple(combination(self.space.free, vector)
-                     for vector in self.examination.uncertainty.undetermined)
-
-    def physical(self) -> dict[str, float]:
-        """Every parameter's physical value in SI units, for a rope like the observed one."""
-        return self.space.physical(self.values, self.length)
 
 
 def calibrate(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, search: Search, *,
@@ -402,48 +307,6 @@ def explained(result: CalibrationResult, simulator: Simulator,
     except CancelledError:
         return result
     return replace(result, explanations=words, seconds=result.seconds + clock() - begun)
-
-
-def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty) -> dict[str, ParameterEstimate]:
-    """Return the parameters of the best evaluation with their uncertainty, in both units."""
-    parameters = {}
-    for k, name in enumerate(space.free):
-        value, lower, upper = (float(x) * SCALE for x in (best.point[k], found.lower[k], found.upper[k]))
-        (at_value, unit), (at_lower, _), (at_upper, _) = (
-            space.reported(name, x) for x in (value, lower, upper))
-        note = '' if found.excited[k] else 'no trial tells anything about it; it keeps its default'
-        if found.at_bound[k]:
-            note = 'at the end of its scale; the best value may lie beyond'
-        verdict = found.verdicts[k]
-        parameters[name] = ParameterEstimate(
-            name, value, float(found.std[k]) * SCALE, lower, upper, at_value, min(at_lower, at_upper),
-            max(at_lower, at_upper), unit, verdict == IDENTIFIABLE, verdict, note)
-    return parameters
-
-
-def combination(names: Sequence[str], vector: Floats) -> str:
-    """Return a combination of parameters in words, e.g. ``flexibility - 0.8 friction``."""
-    largest = float(np.abs(vector).max())
-    words = ''
-    for k in np.argsort(-np.abs(vector), kind='stable'):
-        share = float(vector[k]) / largest
-        if abs(share) >= INVOLVED:
-            sign = ('- ' if share < 0 else '+ ') if words else ('-' if share < 0 else '')
-            size = '' if abs(share) > 0.95 else f'{abs(share):.1f} '
-            words += f'{" " if words else ""}{sign}{size}{names[k]}'
-    return words
-
-
-def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
-    """Return the simulated (g, n, 3) [m] chains of each trial, from the residuals."""
-    assert evaluation.residuals is not None
-    chains, at = [], 0
-    for trial in trials:
-        observed = np.stack([goal.chain.points for goal in trial.goals])
-        residual = evaluation.residuals[at:at + observed.size].reshape(observed.shape)
-        chains.append(frozen_array(observed + residual))
-        at += observed.size
-    return tuple(chains)
 
 
 def _warnings(best: Evaluation, kept: Sequence[Evaluation]) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import calibrate, CalibrationResult, examined
+from dlo_calibration.calibration.calibrate import calibrate, examined
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.chain import frozen_array

@@ -17,9 +17,10 @@ import time
 import traceback
 from typing import Callable, Iterator, Sequence, Union
 
-from dlo_calibration.calibration.calibrate import advised, calibrate, CalibrationResult, confirmed, explained
+from dlo_calibration.calibration.calibrate import advised, calibrate, confirmed, explained
 from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
 from dlo_calibration.calibration.parts import calibrate_parts
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation import processes
 from dlo_calibration.evaluation.cluster import ClusterExecutor

@@ -15,9 +15,9 @@ import sys
 import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
-from dlo_calibration.calibration.calibrate import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.options import Declaration, declarations, Options
+from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
 from dlo_calibration.cli import experiment
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError

@@ -23,8 +23,8 @@ from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import fitted_with, SimulatorFactory
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
-from dlo_calibration.calibration.calibrate import CalibrationResult, ParameterEstimate
+from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.xml import (
     add,

@@ -10,7 +10,7 @@ from typing import Iterator
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.slices import Line, Plane, Slices
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.chain import Floats

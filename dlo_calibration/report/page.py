@@ -17,8 +17,8 @@ from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
 from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import silent
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK

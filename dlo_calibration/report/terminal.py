@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report import sentences

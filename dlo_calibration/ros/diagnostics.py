@@ -8,7 +8,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.trial_information import Gain

@@ -9,7 +9,7 @@ from typing import Any, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats

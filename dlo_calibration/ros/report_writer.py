@@ -10,7 +10,7 @@ import queue
 import threading
 from typing import Iterator
 
-from dlo_calibration.calibration.calibrate import CalibrationResult
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import SimulatorFactory, sliced_with
 from dlo_calibration.report.page import Origin, write_report
 

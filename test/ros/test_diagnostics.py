@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from wire import wire
 
-from dlo_calibration.calibration.calibrate import CalibrationResult, ParameterEstimate
+from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.trial_information import Gain
 from dlo_calibration.model.action import Action, Hand
