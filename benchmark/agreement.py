@@ -20,10 +20,11 @@ from discretisation import DATA, exact_trials
 from figures import SAMPLES, table, write
 import numpy as np
 
-from dlo_calibration import ParameterSpace, SimulationError, Trial
+from dlo_calibration import SimulationError, Trial
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.protocol import Simulator

@@ -29,13 +29,15 @@ sys.path.insert(0, str(HERE))
 
 from discretisation import exact_trials  # noqa: E402
 
-from dlo_calibration import Chain, ParameterSpace, Trial  # noqa: E402
-from dlo_calibration.calibration.calibrate import calibrate  # noqa: E402
+from dlo_calibration import Chain, Trial  # noqa: E402
+from dlo_calibration.calibration.calibrate import fitted  # noqa: E402
 from dlo_calibration.calibration.options import Options  # noqa: E402
-from dlo_calibration.calibration.worker import hints  # noqa: E402
+from dlo_calibration.calibration.setting import Setting  # noqa: E402
 from dlo_calibration.evaluation.evaluation import Evaluator  # noqa: E402
-from dlo_calibration.model.parameters import BY_NAME, PAPER_PARAMETERS  # noqa: E402
-from dlo_calibration.search import LeastSquares  # noqa: E402
+from dlo_calibration.model.parameters import (  # noqa: E402
+    BY_NAME,
+    PAPER_PARAMETERS,  # noqa: E402
+)
 from dlo_calibration.simulation.compiled import CompiledSimulator  # noqa: E402
 
 NOISE = 1e-3  # m, standard deviation of a coordinate
@@ -72,17 +74,15 @@ def draw(name: str, seed: int) -> Draw:
     properties, exact = exact_trials(name)
     generator = np.random.default_rng(seed)
     trials = [noisy(trial, generator) for trial in exact]
-    fitted = [trial for trial in trials if trial.name in FITTED]
+    calibrated = [trial for trial in trials if trial.name in FITTED]
     other = [trial for trial in trials if trial.name not in FITTED]
-    options = Options(mass=properties['mass'])
-    space, simulator = ParameterSpace(PAPER_PARAMETERS, mass=properties['mass']), CompiledSimulator()
-    search = LeastSquares(space.dimension, seed, hints(fitted, options))
+    options = Options(mass=properties['mass'], seed=seed)
     begun = time.perf_counter()
-    result = calibrate(fitted, space, simulator, search, seed=seed)
+    result = fitted(Setting(tuple(calibrated), options, CompiledSimulator()))
     seconds = time.perf_counter() - begun
     truth = np.array([BY_NAME[one].value(properties[TRUTH[one]]) for one in PAPER_PARAMETERS])
     found = [result.parameters[one] for one in PAPER_PARAMETERS]
-    unseen = Evaluator(other, space, simulator).evaluate(0, result.best.point).errors
+    unseen = Evaluator(other, result.space, CompiledSimulator()).evaluate(0, result.best.point).errors
     assert unseen is not None and result.examination is not None
     return Draw(
         np.array([one.value for one in found]), np.array([one.std for one in found]),

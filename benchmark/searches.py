@@ -21,7 +21,7 @@ import numpy as np
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import hints
+from dlo_calibration.calibration.prior import prior
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Observation, SEARCHES
@@ -35,7 +35,7 @@ SHOWN = ('flexibility', 'elasticity', 'friction')
 def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
                 ) -> tuple[list[Observation], Observation]:
     """Return all observations of a search, and the one that it calls its result."""
-    search = SEARCHES[name](evaluator.space.dimension, seed, hints(evaluator.trials, options))
+    search = SEARCHES[name](evaluator.space.dimension, seed, prior(evaluator.trials, options).hints)
     seen: list[Observation] = []
     while len(seen) < BUDGET:
         points = search.ask(BUDGET - len(seen))

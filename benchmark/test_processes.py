@@ -13,8 +13,9 @@ import time
 from figures import HERE, SAMPLES, side_by_side, table, write
 import pytest
 
-from dlo_calibration import calibrate
+from dlo_calibration.calibration.fit import fit
 from dlo_calibration.calibration.options import ENGINES, Options
+from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import RandomSearch
@@ -61,8 +62,8 @@ def test_processes(benchmark, engine, processes):
     ready = {workers: ProcessExecutor(workers) for workers in WORKERS}
 
     def search(executor, budget=evaluations):
-        calibrate(trials, space, make(), RandomSearch(space.dimension, seed=1), budget=budget,
-                  executor=executor, seed=1)
+        setting = Setting(tuple(trials), Options(), make(), executor)
+        fit(setting, space, RandomSearch(space.dimension, seed=1), budget)
 
     def with_start(workers):
         executor = ProcessExecutor(workers)
@@ -92,18 +93,18 @@ PROGRAM = """
 import json, sys, time
 from dlo_calibration.cli import main as cli
 marks = {'imports': time.time()}
-calibrate_with = cli.calibrate_with
-def watched(trials, options, make_simulator, on_evaluation, *rest):
+calibrate = cli.calibrate
+def watched(trials, options, *, on_evaluation, **rest):
     marks['reading'] = time.time()
     def take(evaluation):
         marks.setdefault('first', time.time())
         marks['rounds'] = time.time()
         on_evaluation(evaluation)
     try:
-        return calibrate_with(trials, options, make_simulator, take, *rest)
+        return calibrate(trials, options, on_evaluation=take, **rest)
     finally:
         marks['closing'] = time.time()
-cli.calibrate_with = watched
+cli.calibrate = watched
 code = cli.main(sys.argv[1:])
 marks['writing'] = time.time()
 sys.stderr.write(json.dumps(marks))
@@ -111,7 +112,7 @@ sys.exit(code)
 """
 
 
-def fit(folder, engine, workers):
+def fit_of(folder, engine, workers):
     """Return seconds of each stage of `fit` in a fresh process."""
     begun = time.time()
     done = subprocess.run(
@@ -130,11 +131,11 @@ def fit(folder, engine, workers):
 def test_fit(benchmark, tmp_path, fits):
     engine = next(name for name in MEASURED if name in ENGINES)
     found = {workers: [] for workers in WORKERS}
-    fit(tmp_path / 'warm', engine, WORKERS[-1])  # fills the caches
+    fit_of(tmp_path / 'warm', engine, WORKERS[-1])  # fills the caches
 
     def take():
         for workers, stages in found.items():
-            stages.append(fit(tmp_path / f'{workers}', engine, workers))
+            stages.append(fit_of(tmp_path / f'{workers}', engine, workers))
 
     benchmark.pedantic(take, rounds=ROUNDS)
     for workers, repetitions in found.items():

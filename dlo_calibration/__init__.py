@@ -4,8 +4,9 @@
 """
 Find the physical parameters of a rope, cable, wire or hose from observed manipulations.
 
-Names are imported when they are first used, so that a program which starts from
-this package, such as the node, can listen to signals before NumPy is loaded.
+The public interface is what `__all__` lists. A name is imported when it is first used, so that a
+program which starts from this package, such as the node, can listen to signals before NumPy is
+loaded, and so that nobody loads PyBullet who does not use it.
 """
 
 from importlib import import_module
@@ -13,38 +14,37 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dlo_calibration.calibration.calibrate import calibrate
-    from dlo_calibration.calibration.result import CalibrationResult
+    from dlo_calibration.calibration.options import Options
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
-    from dlo_calibration.evaluation.evaluation import Evaluation
+    from dlo_calibration.files.result import read_result
+    from dlo_calibration.files.session import read_session
     from dlo_calibration.model.action import Action, Hand
     from dlo_calibration.model.chain import Chain
-    from dlo_calibration.model.parameters import Parameter, PARAMETERS, ParameterSpace
     from dlo_calibration.model.trial import Goal, Trial
-    from dlo_calibration.simulation.protocol import Rollout, Simulator
+    from dlo_calibration.simulation.bullet import BulletRope
 
 __all__ = [
-    'PARAMETERS', 'Action', 'CalibrationResult', 'Chain', 'DloCalibrationError', 'Evaluation', 'Goal',
-    'Hand', 'InputError', 'Parameter', 'ParameterSpace', 'Rollout', 'SimulationError', 'Simulator',
-    'Trial', 'calibrate',
+    'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'Goal', 'Hand',
+    'InputError', 'Options', 'SimulationError', 'Trial', 'calibrate', 'read_result', 'read_session',
 ]
 
-_HOMES = {
+_MODULES = {
     'model.action': ('Action', 'Hand'),
-    'calibration.calibrate': ('calibrate',),
-    'calibration.result': ('CalibrationResult',),
     'model.chain': ('Chain',),
-    'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
-    'evaluation.evaluation': ('Evaluation',),
-    'model.parameters': ('PARAMETERS', 'Parameter', 'ParameterSpace'),
-    'simulation.protocol': ('Rollout', 'Simulator'),
     'model.trial': ('Goal', 'Trial'),
+    'calibration.options': ('Options',),
+    'calibration.calibrate': ('calibrate',),
+    'files.session': ('read_session',),
+    'files.result': ('read_result',),
+    'simulation.bullet': ('BulletRope',),
+    'errors': ('DloCalibrationError', 'InputError', 'SimulationError'),
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f'{__name__}.{_HOME[name]}'), name)
+    if name in _MODULE_OF:
+        return getattr(import_module(f'{__name__}.{_MODULE_OF[name]}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 

@@ -20,9 +20,9 @@ from typing import Sequence
 
 import numpy as np
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.files.request import GoalRequest, Request, TrialRequest, write_request
 from dlo_calibration.files.result import write_result
 from dlo_calibration.files.session import read_session, session_trials
@@ -133,7 +133,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     trials, _ = session_trials(read_session(HERE / 'object1'), Options())
     rounded_trials = [replace(trial, initial=rounded(trial.initial.points)) for trial in trials]
     options = Options.of({**FIT, 'workers': 2})
-    result = calibrate_with(rounded_trials, options, make_simulator, lambda _: None, lambda: False)
+    result = calibrate(rounded_trials, options,
+                       make_simulator=make_simulator)
     write_result(folder / 'dlo.xml', result, options.flat())
     return 0
 

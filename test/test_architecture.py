@@ -28,7 +28,7 @@ ONLY = {
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
-    'dlo_calibration.simulation.bullet': ('calibration/engines.py',),
+    'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py'),
     'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
@@ -116,7 +116,7 @@ def test_a_command_loads_only_what_it_needs(words, needed, tmp_path):
 def test_the_compiled_engine_loads_no_other_slow_library():
     program = f"""
 import sys
-from {PACKAGE} import ParameterSpace
+from {PACKAGE}.model.parameters import ParameterSpace
 from {PACKAGE}.simulation.compiled import CompiledSimulator
 from {PACKAGE}.calibration.options import Options
 from {PACKAGE}.files.session import read_session, session_trials

@@ -15,6 +15,8 @@ from dlo_calibration.simulation.protocol import Simulator
 
 INSTALL = 'pip install numba, or apt install python3-numba'
 SLOWER = 'rounds are simulated by PyBullet, about 30 times slower, because'
+SimulatorFactory = Callable[[Options], Simulator]
+
 LOG = logging.getLogger('dlo_calibration.calibration.engines')
 
 

@@ -19,9 +19,9 @@ import queue
 import threading
 from typing import Any, Iterator, Sequence, Union
 
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluation import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor

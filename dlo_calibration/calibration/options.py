@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Iterator, Mapping
 
-from dlo_calibration.calibration.calibrate import PAPER_EVALUATIONS
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.parameters import (
     BY_NAME,
@@ -27,6 +26,7 @@ from dlo_calibration.model.parameters import (
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 
+PAPER_EVALUATIONS = 150  # the paper's rounds
 AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
 CONFIRMING = 'bullet'
 ENGINES = (AUTO, CONFIRMING, 'compiled')

@@ -5,21 +5,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.fit import Fit
+from dlo_calibration.calibration.prior import Prior
+from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation, mean_length
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.missing_parameters import Explanation
-from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, Uncertainty
+from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Trial
+
+DEFAULT = 'no trial tells anything about it; it keeps its default'
+GUESS = 'no trial tells anything about it; guessed from the height at which the DLO lies'
 
 
 @dataclass(frozen=True)
@@ -78,6 +84,20 @@ class CalibrationResult:
     advice: Advice | None = None
     explanations: tuple[Explanation, ...] = ()
 
+    @classmethod
+    def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:
+        """Return what a fit found; `seconds` is 0 until the calibration has ended."""
+        trials, best, examination = setting.trials, found.best, found.examination
+        uncertainty = spread_of_best(found.evaluations, best.point)
+        if examination is not None:
+            uncertainty = examination.uncertainty if examination.regular else replace(
+                uncertainty, excited=examination.uncertainty.excited)
+        return cls(
+            space=found.space, parameters=estimates(found.space, best, uncertainty, known.guessed), best=best,
+            trials=trials, chains=simulated_chains(trials, best), evaluations=found.evaluations, seconds=0.0,
+            search=found.search, engine=setting.simulator.name, stop_reason=found.stop_reason,
+            seed=setting.options.seed, warnings=_warnings(best, found.evaluations), examination=examination)
+
     @property
     def values(self) -> dict[str, float]:
         """Found parameters on the 0..100 scale, by name."""
@@ -119,14 +139,19 @@ class CalibrationResult:
         return self.space.physical(self.values, self.length)
 
 
-def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty) -> dict[str, ParameterEstimate]:
-    """Return the parameters of the best evaluation with their uncertainty, in both units."""
+def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty,
+              guessed: Sequence[str] = ()) -> dict[str, ParameterEstimate]:
+    """
+    Return the parameters of the best evaluation with their uncertainty, in both units.
+
+    :param guessed: names of those whose default is a guess from the chains alone.
+    """
     parameters = {}
     for k, name in enumerate(space.free):
         value, lower, upper = (float(x) * SCALE for x in (best.point[k], found.lower[k], found.upper[k]))
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
-        note = '' if found.excited[k] else 'no trial tells anything about it; it keeps its default'
+        note = '' if found.excited[k] else GUESS if name in guessed else DEFAULT
         if found.at_bound[k]:
             note = 'at the end of its scale; the best value may lie beyond'
         verdict = found.verdicts[k]
@@ -159,3 +184,14 @@ def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[F
         chains.append(frozen_array(observed + residual))
         at += observed.size
     return tuple(chains)
+
+
+def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
+    warnings = []
+    if best.unsettled:
+        warnings.append(f'never came to rest: {", ".join(best.unsettled)}; compared as it was at the limit')
+    failed = [evaluation for evaluation in evaluations if evaluation.failure]
+    if failed:
+        warnings.append(f'{len(failed)} of {len(evaluations)} evaluations could not be simulated: '
+                        f'{failed[0].failure}')
+    return tuple(warnings)

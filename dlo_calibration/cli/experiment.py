@@ -15,8 +15,8 @@ import shlex
 import time
 from typing import Any, Callable, Iterator, Mapping, Protocol, Sequence, TextIO
 
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import tables as report

@@ -15,10 +15,12 @@ import sys
 import time
 from typing import Any, Callable, Mapping, NoReturn, Sequence, TextIO
 
+from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
-from dlo_calibration.calibration.worker import calibrate_with, confirmed_with, SimulatorFactory, sliced_with
+from dlo_calibration.calibration.stages import confirmed, sliced
 from dlo_calibration.cli import experiment
 from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
@@ -220,7 +222,9 @@ def _fit(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     with StopFlag() as stop:
         with SearchBar(found.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
             try:
-                result = calibrate_with(trials, found.options, make_simulator, bar.take, stop, tell)
+                result = calibrate(
+                    trials, found.options, on_evaluation=bar.take, on_notice=tell, should_stop=stop,
+                    make_simulator=make_simulator)
             except SimulationError:
                 if not stop():
                     raise
@@ -238,7 +242,7 @@ def _validate(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
     file = read_result(chosen.result)
     found = _read(chosen, _note, file.options)
     result = validated(file, _some(found), found.options, make_simulator)
-    result = confirmed_with(result, found.options, make_simulator)
+    result = confirmed(result, found.options, make_simulator)
     _print_result(result, chosen.json)
     return 0
 
@@ -385,7 +389,7 @@ def _write(folder: Path, source: Path, found: _Input, result: CalibrationResult,
     origin = Origin(source.name, repeating_command(repeated, found.options), found.options,
                     digests([*_recorded(source), folder / repeated]),
                     [*found.session.problems, *found.refusals])
-    slices = sliced_with(result, found.options, make_simulator, should_stop)
+    slices = sliced(result, found.options, make_simulator, should_stop)
     write_report(folder / REPORT, result, origin, slices)
 
 

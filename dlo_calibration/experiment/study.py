@@ -19,13 +19,16 @@ import hashlib
 import json
 import os
 from pathlib import Path
+import time
 from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.calibrate import fitted
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import fitted_with, SimulatorFactory
+from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.chain import Floats
@@ -184,10 +187,10 @@ def perform(task: Task, make_simulator: SimulatorFactory,
 
     :raises CancelledError: when stopped.
     """
-    options, trials = task.options, task.trials
+    options, trials, begun = task.options, task.trials, time.monotonic()
     with closing(make_simulator(options)) as simulator:
         try:
-            result = fitted_with(trials, options, simulator, should_stop=should_stop)
+            result = fitted(Setting(trials, options, simulator, should_stop=should_stop))
         except SimulationError as error:
             if should_stop():
                 raise CancelledError from error
@@ -199,7 +202,7 @@ def perform(task: Task, make_simulator: SimulatorFactory,
         name for name, there in zip(result.space.free, examined.uncertainty.excited, strict=True) if there)
     return Outcome(
         values=result.values, excited=excited, score=result.best.score, error=result.errors.mean,
-        evaluations=len(result.evaluations), simulations=result.simulations, seconds=result.seconds,
+        evaluations=len(result.evaluations), simulations=result.simulations, seconds=time.monotonic() - begun,
         judgements=_judgements(task.judges, result, make_simulator))
 
 

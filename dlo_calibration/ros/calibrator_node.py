@@ -35,10 +35,12 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import Appraiser
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import Failure, Notice, Progress, SimulatorFactory, Worker
+from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document

@@ -9,9 +9,9 @@ from pathlib import Path
 import time
 from typing import Callable
 
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import SimulatorFactory
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result

@@ -10,8 +10,9 @@ import queue
 import threading
 from typing import Iterator
 
+from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import SimulatorFactory, sliced_with
+from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.report.page import Origin, write_report
 
 PATIENCE = 10.0  # s that the end waits for a page
@@ -50,7 +51,7 @@ class Reporter:
 
     def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
         try:
-            slices = sliced_with(result, origin.options, self._make_simulator, self._stop.is_set)
+            slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
             write_report(path, result, origin, slices)
         except Exception as error:  # a thread that dies silently leaves the user without a page and a reason
             self._failures.put(f'the report could not be written: {" ".join(str(error).split()) or error!r}')

@@ -10,21 +10,16 @@ import threading
 import time
 from typing import ClassVar
 
+from fitting import fitted
 import numpy as np
 import pytest
-from toy_simulator import toy_trial, ToySimulator
+from toy_simulator import new_toy, toy_trial, ToySimulator
 
-from dlo_calibration import (
-    calibrate,
-    Goal,
-    InputError,
-    ParameterSpace,
-    Rollout,
-    SimulationError,
-    Trial,
-)
-from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration import calibrate, Goal, InputError, SimulationError, Trial
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.search import SEARCHES
+from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
 TRIALS = (toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=1.0))
@@ -36,7 +31,7 @@ def search(space=None, seed=1, name='random'):
 
 def found(trials=TRIALS, space=None, simulator=None, seed=1, **rest):
     space = space or ParameterSpace()
-    return calibrate(trials, space, simulator or ToySimulator(), search(space, seed), seed=seed, **rest)
+    return fitted(trials, space, simulator or ToySimulator(), search(space, seed), seed=seed, **rest)
 
 
 @pytest.mark.parametrize('name', TRUTH)
@@ -72,7 +67,7 @@ def test_a_parameter_without_effect_is_not_identifiable():
 def searched(space, truth=TRUTH):
     """Return what least squares finds on two trials."""
     trials = (toy_trial(truth), toy_trial(truth, 'trial 2', turn=1.0))
-    return calibrate(trials, space, ToySimulator(), search(space, name='least_squares'), budget=120)
+    return fitted(trials, space, ToySimulator(), search(space, name='least_squares'), budget=120)
 
 
 def test_a_parameter_that_no_trial_tells_about_keeps_its_default_and_says_so():
@@ -103,7 +98,7 @@ def test_a_default_that_the_trials_refute_is_not_kept(default, kept):
     trials = [replace(trial, goals=(replace(trial.goals[0], chain=replace(
         trial.goals[0].chain, points=trial.goals[0].chain.points + rough.normal(0, 1e-3, (11, 3)))),))
         for trial in TRIALS]
-    result = calibrate(trials, space, Numb(), search(space, name='least_squares'), budget=120)
+    result = fitted(trials, space, Numb(), search(space, name='least_squares'), budget=120)
     elasticity = result.parameters['elasticity']
     assert elasticity.verdict == 'not identifiable'
     assert (elasticity.value == default) is kept
@@ -206,8 +201,8 @@ def test_the_budget_is_spent_and_not_more(budget):
 
 def test_the_record_says_how_it_was_found():
     ticks = iter([10.0, 17.5])
-    result = calibrate(TRIALS, ParameterSpace(), ToySimulator(), search(seed=7), budget=3, seed=7,
-                       clock=lambda: next(ticks))
+    options = Options(search='random', evaluations=3, seed=7, workers=1, engine='compiled')
+    result = calibrate(TRIALS, options, make_simulator=new_toy, clock=lambda: next(ticks))
     assert (result.seed, result.engine, result.search, result.seconds) == (7, 'toy', 'random', 7.5)
     assert result.trials == TRIALS
     assert result.warnings == ()
@@ -230,7 +225,7 @@ def test_a_search_that_finishes_early_says_why():
             self.told += observations
 
     finished = Finished()
-    result = calibrate(TRIALS, ParameterSpace(), ToySimulator(), finished)
+    result = fitted(TRIALS, ParameterSpace(), ToySimulator(), finished)
     assert len(result.evaluations) == 2
     assert result.stop_reason == 'it cannot get better'
     assert [one.score for one in finished.told] == [evaluation.score for evaluation in result.evaluations]
@@ -333,7 +328,7 @@ def test_an_error_that_nobody_expects_is_not_hidden():
 
 def test_without_trials_there_is_nothing_to_calibrate():
     with pytest.raises(InputError, match='no trials, expected at least one complete trial; record'):
-        found(trials=())
+        calibrate(())
 
 
 def scores(evaluation):

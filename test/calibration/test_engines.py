@@ -7,12 +7,13 @@ import logging
 import sys
 
 import pytest
+from toy_messages import toy_trials
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration import engines
 from dlo_calibration.calibration.engines import ENGINES, make_simulator
 from dlo_calibration.calibration.options import ENGINES as NAMES
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.bullet import BulletSimulator
 
@@ -111,7 +112,7 @@ def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
 def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engine):
     options = Options(engine=engine, scene='nowhere.urdf', workers=1)
     with pytest.raises(InputError, match='scene nowhere.urdf: got .*No such file.*expected a URDF file'):
-        calibrate_with((), options, make_simulator)
+        calibrate(toy_trials(1), options, make_simulator=make_simulator)
 
 
 def test_a_path_is_relative_to_the_working_directory(scene, tmp_path, monkeypatch):

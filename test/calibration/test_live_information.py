@@ -10,11 +10,11 @@ import time
 from processes import children
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.live_information import Appraiser
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.trial import Goal
 
@@ -78,7 +78,7 @@ def test_a_trial_under_way_waits_until_it_has_a_goal_at_rest(appraiser):
 
 
 def test_trials_of_a_result_are_not_appraised_and_later_ones_add_to_it(appraiser):
-    result = calibrate_with(TRIALS[:2], OPTIONS, lambda _: ToySimulator())
+    result = calibrate(TRIALS[:2], OPTIONS, make_simulator=new_toy)
     assert result.examination.regular
     gain, = appraised(appraiser, TRIALS, result)
     assert gain.trial == 'trial 3'

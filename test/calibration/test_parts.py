@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_calibration.calibration.parts import calibrate_parts
+from dlo_calibration.calibration.calibrate import fitted
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
 POINTS, LENGTH = 15, 0.8
@@ -47,9 +48,9 @@ def observed(space, values):
         for trial, rollout in zip(trials, rollouts, strict=True)]
 
 
-def calibrated(trials, budget=200, **options):
-    search = LeastSquares(EVEN.dimension, 1, Hints.none(EVEN.dimension))
-    return calibrate_parts(trials, EVEN, CompiledSimulator(table=False), search, budget=budget, **options)
+def calibrated(trials, budget=200, **rest):
+    options = Options(calibrate=EVEN.free, parts=0, evaluations=budget)
+    return fitted(Setting(tuple(trials), options, CompiledSimulator(table=False), **rest))
 
 
 @pytest.fixture(scope='module')
@@ -92,26 +93,26 @@ def test_the_same_in_parts_is_the_same_dlo(found):
 
 def test_an_even_dlo_stays_in_one_part():
     result = calibrated(observed(EVEN, TRUTH))
-    assert result.space == EVEN
+    assert result.space.free == EVEN.free
     assert result.values == pytest.approx(TRUTH, abs=1.0)
     assert '1 part: 4 would not predict left-out trials better' in result.stop_reason
 
 
 def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):
     result = calibrated(stiff_middle, budget=13)
-    assert result.space == EVEN
+    assert result.space.free == EVEN.free
     assert len(result.evaluations) <= 13
     assert result.stop_reason.endswith('1 part: too few evaluations are left of the budget to try 2')
 
 
 def test_without_a_second_trial_nothing_can_be_left_out(stiff_middle):
-    assert calibrated(stiff_middle[:1], budget=30).space == EVEN
+    assert calibrated(stiff_middle[:1], budget=30).space.free == EVEN.free
 
 
 def test_a_stop_keeps_the_parts_that_were_found(stiff_middle, found):
     even = next(k for k, one in enumerate(found[1]) if 'stiffness_2' in one.values)
     seen = []
     result = calibrated(stiff_middle, on_evaluation=seen.append, should_stop=lambda: len(seen) > even + 3)
-    assert result.space == EVEN
+    assert result.space.free == EVEN.free
     assert len(result.evaluations) == len(seen) == even + 4
     assert result.stop_reason.endswith('1 part: stopped before 2 were fitted')

@@ -15,14 +15,17 @@ import numpy as np
 from processes import children
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import Deadly, ToySimulator
+from toy_simulator import Deadly, new_toy, ToySimulator
 
-from dlo_calibration import CalibrationResult, DloCalibrationError, Evaluation
+from dlo_calibration import calibrate, DloCalibrationError
 from dlo_calibration.calibration.engines import ENGINES
 from dlo_calibration.calibration.options import ENGINES as ENGINE_NAMES
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with, Failure, Notice, Progress, Worker
+from dlo_calibration.calibration.progress import Progress
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.evaluation import processes
+from dlo_calibration.evaluation.evaluation import Evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0
@@ -49,8 +52,8 @@ def test_gives_every_evaluation_in_order_and_then_the_result(workers):
 
 
 def test_result_does_not_depend_on_the_number_of_processes():
-    one, two, four = (calibrate_with(toy_trials(2), options(workers=n, evaluations=100),
-                                     lambda _: ToySimulator()) for n in (1, 2, 4))
+    one, two, four = (calibrate(toy_trials(2), options(workers=n, evaluations=100),
+                                make_simulator=new_toy) for n in (1, 2, 4))
     for other in (two, four):
         assert one.parameters == other.parameters
         assert one.simulations == other.simulations
@@ -62,8 +65,8 @@ def test_result_does_not_depend_on_the_number_of_processes():
 @pytest.mark.parametrize('name', ['flexibility', 'elasticity', 'friction'])
 def test_finds_the_truth_of_one_parameter_where_the_others_are_known(name):
     known = {other: value for other, value in TRUTH.items() if other != name}
-    result = calibrate_with(toy_trials(2), options(evaluations=300, calibrate=[name], **known),
-                            lambda _: ToySimulator())
+    result = calibrate(toy_trials(2), options(evaluations=300, calibrate=[name], **known),
+                       make_simulator=new_toy)
     assert abs(result.values[name] - TRUTH[name]) < 1
     assert result.parameters[name].identifiable
 
@@ -138,7 +141,7 @@ def test_killed_process_is_told_at_once_and_in_the_result_which_stays_the_same()
     notice, = (event for event in events if isinstance(event, Notice))
     assert 'was killed by SIGKILL' in notice.text
     assert result.warnings == (notice.text,)
-    alone = calibrate_with(toy_trials(2), options(evaluations=150), lambda _: ToySimulator())
+    alone = calibrate(toy_trials(2), options(evaluations=150), make_simulator=new_toy)
     assert result.parameters == alone.parameters
     assert result.best.residuals.tobytes() == alone.best.residuals.tobytes()
     assert [e.index for e in events if isinstance(e, Evaluation)] == list(range(150))
@@ -146,10 +149,10 @@ def test_killed_process_is_told_at_once_and_in_the_result_which_stays_the_same()
 
 def test_an_evaluation_whose_process_dies_is_repeated(tmp_path):
     told = []
-    result = calibrate_with(toy_trials(2), options(workers=2, evaluations=60),
-                            lambda _: Deadly(tmp_path / 'died'), on_notice=told.append)
+    result = calibrate(toy_trials(2), options(workers=2, evaluations=60),
+                       make_simulator=lambda _: Deadly(tmp_path / 'died'), on_notice=told.append)
     assert len(told) == 1
-    alone = calibrate_with(toy_trials(2), options(evaluations=60), lambda _: ToySimulator())
+    alone = calibrate(toy_trials(2), options(evaluations=60), make_simulator=new_toy)
     assert result.parameters == alone.parameters
     assert result.chains[0].tobytes() == alone.chains[0].tobytes()
 
@@ -157,8 +160,8 @@ def test_an_evaluation_whose_process_dies_is_repeated(tmp_path):
 def test_an_evaluation_that_kills_every_process_ends_the_calibration():
     told = []
     with pytest.raises(DloCalibrationError, match='3 processes one after the other .* fewer workers'):
-        calibrate_with(toy_trials(1), options(workers=2, evaluations=60), lambda _: Deadly(),
-                       on_notice=told.append)
+        calibrate(toy_trials(1), options(workers=2, evaluations=60),
+                  make_simulator=lambda _: Deadly(), on_notice=told.append)
     assert len(told) >= 3
 
 
@@ -176,7 +179,7 @@ class Compiling(ToySimulator):
 
 
 def test_the_simulator_is_prepared_before_any_copy_is_made():
-    result = calibrate_with(toy_trials(1), options(workers=2, evaluations=4), lambda _: Compiling())
+    result = calibrate(toy_trials(1), options(workers=2, evaluations=4), make_simulator=lambda _: Compiling())
     assert len(result.evaluations) == 4
 
 

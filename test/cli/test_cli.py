@@ -19,10 +19,10 @@ import time
 from processes import children
 import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
-from toy_simulator import Deadly, ToySimulator
+from toy_simulator import Deadly, new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
@@ -86,7 +86,7 @@ def test_fit_prints_one_document_with_every_key(run, session):
 
 def test_fit_gives_what_the_library_gives(run, session):
     found = only_json(run('fit', session, '--json')[1])
-    result = calibrate_with(toy_trials(2), Options.of({'evaluations': 20}), lambda _: ToySimulator())
+    result = calibrate(toy_trials(2), Options.of({'evaluations': 20}), make_simulator=new_toy)
     assert {name: one['value'] for name, one in found['parameters'].items()} == pytest.approx(result.values)
 
 

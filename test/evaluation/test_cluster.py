@@ -15,11 +15,10 @@ import time
 
 import pytest
 from toy_messages import toy_trials
-from toy_simulator import Deadly, ToySimulator
+from toy_simulator import Deadly, new_toy, ToySimulator
 
-from dlo_calibration import DloCalibrationError, InputError
+from dlo_calibration import calibrate, DloCalibrationError, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.evaluation import cluster
 
 distributed = pytest.importorskip('distributed', reason='the extra "distributed" of setup.py has it')
@@ -82,9 +81,9 @@ def same(first, second):
 
 def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines, capfd):
     address, processes = machines
-    alone = calibrate_with(toy_trials(2), options(), lambda _: ToySimulator())
+    alone = calibrate(toy_trials(2), options(), make_simulator=new_toy)
     told = []
-    whole = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(), on_notice=told.append)
+    whole = calibrate(toy_trials(2), options(address), make_simulator=new_toy, on_notice=told.append)
     same(alone, whole)
     assert told == []
 
@@ -92,8 +91,8 @@ def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines,
         if evaluation.index == 10:
             os.kill(processes[1].pid, signal.SIGKILL)
 
-    torn = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(0.005), kill,
-                          on_notice=told.append)
+    torn = calibrate(toy_trials(2), options(address),
+                     make_simulator=lambda _: ToySimulator(0.005), on_evaluation=kill, on_notice=told.append)
     same(alone, torn)
     assert len(told) == 1
     assert 'the scheduler lost the worker tcp://127.0.0.1:' in told[0]
@@ -104,8 +103,9 @@ def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines,
 def test_a_stop_leaves_nothing_at_the_scheduler(machines):
     address, _ = machines
     seen = []
-    result = calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.05),
-                            seen.append, lambda: len(seen) >= 3)
+    result = calibrate(toy_trials(1), options(address, evaluations=10000),
+                       make_simulator=lambda _: ToySimulator(0.05), on_evaluation=seen.append,
+                       should_stop=lambda: len(seen) >= 3)
     assert result.stop_reason == 'stopped on request'
     assert len(result.evaluations) == 3
     with distributed.Client(address, set_as_default=False) as client:
@@ -118,8 +118,8 @@ def test_a_stop_leaves_nothing_at_the_scheduler(machines):
 def test_without_workers_it_says_so_and_waits(tmp_path):
     told = []
     with running(tmp_path, 0) as (address, _), pytest.raises(DloCalibrationError, match='stopped before the'):
-        calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator(), None,
-                       lambda: bool(told), told.append)
+        calibrate(toy_trials(1), options(address),
+                  make_simulator=new_toy, should_stop=lambda: bool(told), on_notice=told.append)
     assert 'has no workers yet' in told[0]
 
 
@@ -132,7 +132,7 @@ def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(tmp_pat
                           PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
             processes.append(worker)
             with pytest.raises(InputError, match=words):
-                calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator())
+                calibrate(toy_trials(1), options(address), make_simulator=new_toy)
             worker.kill()
             worker.wait()
 
@@ -140,7 +140,7 @@ def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(tmp_pat
 def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_do(tmp_path):
     with running(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES='0') as (address, _):
         with pytest.raises(DloCalibrationError, match='1 workers of the scheduler .* give them more memory'):
-            calibrate_with(toy_trials(1), options(address), lambda _: Deadly())
+            calibrate(toy_trials(1), options(address), make_simulator=lambda _: Deadly())
 
 
 def test_the_last_worker_has_a_while_to_come_back(tmp_path, monkeypatch):
@@ -149,7 +149,8 @@ def test_the_last_worker_has_a_while_to_come_back(tmp_path, monkeypatch):
     with running(tmp_path, 1) as (address, _):
         wait_for_workers(address, 1)
         with pytest.raises(DloCalibrationError, match='lost its last worker, and none came back within 1 s'):
-            calibrate_with(toy_trials(1), options(address), lambda _: Deadly(), on_notice=told.append)
+            calibrate(toy_trials(1), options(address),
+                      make_simulator=lambda _: Deadly(), on_notice=told.append)
     assert len(told) == 1
     assert 'the scheduler lost the worker' in told[0]
 
@@ -162,15 +163,16 @@ def test_a_worker_that_comes_back_goes_on(tmp_path, monkeypatch):
                 processes[1].kill()
                 processes.append(dask('worker', address, '--no-nanny', '--nthreads', '1'))
 
-        torn = calibrate_with(toy_trials(2), options(address), lambda _: ToySimulator(0.005), replace)
-    same(torn, calibrate_with(toy_trials(2), options(), lambda _: ToySimulator()))
+        torn = calibrate(toy_trials(2), options(address),
+                         make_simulator=lambda _: ToySimulator(0.005), on_evaluation=replace)
+    same(torn, calibrate(toy_trials(2), options(), make_simulator=new_toy))
 
 
 def test_a_scheduler_that_is_killed_ends_the_calibration(machines, capfd):
     address, (scheduler, *_) = machines
     with pytest.raises(DloCalibrationError, match=f'the scheduler {address} is lost'):
-        calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.01),
-                       lambda _: scheduler.kill())
+        calibrate(toy_trials(1), options(address, evaluations=10000),
+                  make_simulator=lambda _: ToySimulator(0.01), on_evaluation=lambda _: scheduler.kill())
     assert capfd.readouterr() == ('', '')
 
 
@@ -182,15 +184,16 @@ def test_a_scheduler_that_hangs_holds_nobody_up(machines):
         seen.append(evaluation)
         scheduler.send_signal(signal.SIGSTOP)
 
-    result = calibrate_with(toy_trials(1), options(address, evaluations=10000), lambda _: ToySimulator(0.01),
-                            freeze, lambda: bool(seen))
+    result = calibrate(toy_trials(1), options(address, evaluations=10000),
+                       make_simulator=lambda _: ToySimulator(0.01), on_evaluation=freeze,
+                       should_stop=lambda: bool(seen))
     assert result.stop_reason == 'stopped on request'
 
 
 @pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])
 def test_an_address_that_is_none_is_refused(address):
     with pytest.raises(InputError, match='parameter scheduler: got .* start one with: dask scheduler'):
-        calibrate_with(toy_trials(1), options(address), lambda _: ToySimulator())
+        calibrate(toy_trials(1), options(address), make_simulator=new_toy)
 
 
 def test_a_scheduler_that_does_not_answer_is_refused():
@@ -203,4 +206,4 @@ def test_a_scheduler_that_does_not_answer_is_refused():
 def test_without_the_library_it_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     with pytest.raises(InputError, match=r"pip install 'dlo_calibration\[distributed\]'"):
-        calibrate_with(toy_trials(1), options('tcp://127.0.0.1:1'), lambda _: ToySimulator())
+        calibrate(toy_trials(1), options('tcp://127.0.0.1:1'), make_simulator=new_toy)

@@ -14,7 +14,6 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import hints
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment.study import (
     Journal,
@@ -29,7 +28,6 @@ from dlo_calibration.experiment.study import (
 )
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.search import SEARCHES
 
 OPTIONS = Options.of({'evaluations': 40})
 
@@ -64,8 +62,8 @@ def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back()
 def test_one_calibration_finds_what_the_library_finds():
     done = perform(task(search='least_squares', seed=3), toy)
     trials = toy_trials(3)
-    search = SEARCHES['least_squares'](4, 3, hints(trials, OPTIONS))
-    result = calibrate(trials, OPTIONS.space, ToySimulator(), search, budget=40)
+    options = replace(OPTIONS, search='least_squares', seed=3)
+    result = calibrate(trials, options, make_simulator=toy)
     assert done.values == result.values
     assert (done.score, done.error) == (result.best.score, result.errors.mean)
     assert (done.evaluations, done.simulations) == (len(result.evaluations), result.simulations)

@@ -6,6 +6,7 @@
 from pathlib import Path
 import re
 
+from fitting import fitted
 import pytest
 
 from dlo_calibration.calibration.options import declarations
@@ -59,7 +60,6 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     """Execute the three lines of README on a result that was fitted and written."""
     import pybullet
 
-    from dlo_calibration.calibration.calibrate import calibrate
     from dlo_calibration.calibration.options import Options
     from dlo_calibration.files.result import read_result, write_result
     from dlo_calibration.files.session import read_session, session_trials
@@ -71,9 +71,9 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     session = read_session(ROOT / 'msg_samples/object1')
     trials, _ = session_trials(session, Options.of(session.options))
     simulator = BulletSimulator()
-    fitted = calibrate(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
+    result = fitted(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
     simulator.close()
-    write_result(tmp_path / 'result.xml', fitted)
+    write_result(tmp_path / 'result.xml', result)
     snippet = (ROOT / 'README.md').read_text(encoding='utf-8').split('```python\n')[1].split('```')[0]
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)

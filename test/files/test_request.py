@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from toy_messages import toy_trials
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.request import (
@@ -303,8 +303,7 @@ def file(tmp_path):
 def test_fit_of_a_request_gives_what_the_library_gives(command, file):
     code, output, _ = command('fit', file, '--json')
     found = json.loads(output)
-    result = calibrate_with(toy_trials(2), Options.of({'evaluations': 20, 'mass': 0.2}),
-                            lambda _: ToySimulator())
+    result = calibrate(toy_trials(2), Options.of({'evaluations': 20, 'mass': 0.2}), make_simulator=new_toy)
     assert code == 0
     assert {name: one['value'] for name, one in found['parameters'].items()} == result.values
     assert (found['trials'], found['evaluations'], found['score']) == (2, 20, result.best.score)

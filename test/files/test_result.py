@@ -6,6 +6,7 @@
 from dataclasses import asdict, replace
 import re
 
+from fitting import fitted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import etree
@@ -13,7 +14,6 @@ import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.evaluation import Evaluator
@@ -35,7 +35,7 @@ TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collis
 def calibrated(seed=1, mass=0.1 + 0.2):
     space = ParameterSpace(('friction', 'flexibility'), {'elasticity': 100 / 3, 'damping': 1 / 3}, mass)
     trials = [toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=0.3)]
-    return calibrate(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
+    return fitted(trials, space, ToySimulator(), RandomSearch(2, seed), budget=20, seed=seed)
 
 
 @pytest.fixture(scope='module')
@@ -63,7 +63,7 @@ def test_same_physical_values_bit_for_bit(tmp_path, seed, mass):
 
 def test_value_of_a_found_parameter_in_the_options_does_not_count(tmp_path):
     space = Options.of({'calibrate': ['friction'], 'friction': 12.0, 'damping': 80.0}).space
-    result = calibrate([toy_trial(TRUTH)], space, ToySimulator(), RandomSearch(1, 1), budget=3)
+    result = fitted([toy_trial(TRUTH)], space, ToySimulator(), RandomSearch(1, 1), budget=3)
     write_result(tmp_path / 'result.xml', result)
     found = read_result(tmp_path / 'result.xml')
     assert found.physical() == result.physical()

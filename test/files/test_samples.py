@@ -8,6 +8,7 @@ import itertools
 import json
 from pathlib import Path
 
+from fitting import fitted
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
@@ -15,12 +16,12 @@ from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
 from wire import wire
 
-from dlo_calibration import calibrate, ParameterSpace
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 
@@ -114,7 +115,7 @@ def test_yaml_messages_show_the_first_trial_of_object1(types):
 
 def test_yaml_messages_calibrate(types):
     simulator = BulletSimulator(nodes=31, time_step=0.004)
-    result = calibrate(sample_trials(sample_messages(types)), ParameterSpace(mass=0.03), simulator,
+    result = fitted(sample_trials(sample_messages(types)), ParameterSpace(mass=0.03), simulator,
                        RandomSearch(4, seed=1), budget=2)
     simulator.close()
     assert len(result.evaluations) == 2

@@ -18,9 +18,8 @@ from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 from wrong_input import mutations
 
-from dlo_calibration import InputError
+from dlo_calibration import calibrate, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files import recording
 from dlo_calibration.files.session import read_session, session_trials
@@ -251,8 +250,8 @@ def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, co
     monkeypatch.setattr(Path, 'write_bytes', lambda p, *a, **k: refuse(p) or write_bytes(p, *a, **k))
     monkeypatch.setattr(Path, 'open', lambda p, *a, **k: refuse(p) or fopen(p, *a, **k))
     monkeypatch.setattr(shutil, 'copyfile', lambda a, b: refuse(b) or copyfile(a, b))
-    monkeypatch.setattr(cli, 'calibrate_with',
-                        lambda *args: done.append(1) or calibrate_with(*args))
+    monkeypatch.setattr(cli, 'calibrate',
+                        lambda *args, **rest: done.append(1) or calibrate(*args, **rest))
     code, result, errors = command('fit', path, '--json', '--output', tmp_path / 'out')
     assert (code, result['trials']) == (2, 2)
     error, = errors

@@ -5,15 +5,20 @@
 
 from dataclasses import replace
 
+from fitting import fitted
 import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
 
-from dlo_calibration import calibrate, Chain, Goal, ParameterSpace, Rollout, SimulationError, Trial
-from dlo_calibration.calibration.calibrate import advised
+from dlo_calibration import Chain, Goal, SimulationError, Trial
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.calibration.stages import advised
 from dlo_calibration.inference.advice import advise, candidates, expected_std
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import SEARCHES
+from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
@@ -51,7 +56,7 @@ def observed(name, simulator=None, seed=0, trial=None):
 
 
 def found(simulator, *trials):
-    return calibrate(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
+    return fitted(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
 
 
 def advice_for(simulator, result, **rest):
@@ -152,9 +157,10 @@ def test_a_stop_gives_no_advice():
 def test_a_result_that_is_no_minimum_gets_no_advice():
     simulator = Telling('drag')
     result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
-    assert advised(result, simulator).advice is not None
+    setting = Setting(result.trials, Options(), simulator)
+    assert advised(setting, result).advice is not None
     for examination in (None, replace(result.examination, regular=False)):
-        assert advised(replace(result, examination=examination), simulator).advice is None
+        assert advised(setting, replace(result, examination=examination)).advice is None
 
 
 def test_what_is_expected_of_no_information_is_what_is_known():

@@ -5,15 +5,15 @@
 
 import json
 
+from fitting import fitted
 import numpy as np
 import pytest
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
 
-from dlo_calibration import Rollout, SimulationError
-from dlo_calibration.calibration.calibrate import calibrate, confirmed
+from dlo_calibration import calibrate, SimulationError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
+from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
@@ -24,6 +24,7 @@ from dlo_calibration.report.page import Origin, write_report
 from dlo_calibration.report.terminal import error_facts
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.simulation.protocol import Rollout
 
 OPTIONS = Options(evaluations=20, workers=1)
 
@@ -52,10 +53,9 @@ class SecondToy(ToySimulator):
         return Rollout(found.chains + (0, self.shift, 0), found.settled, found.duration, found.steps)
 
 
-def found(second, clock=lambda: 0.0):
-    trials = toy_trials(2)
-    result = calibrate(trials, ParameterSpace(), ToySimulator(), RandomSearch(4, 1), budget=20, clock=clock)
-    return result, confirmed(result, second, clock=clock)
+def found(second):
+    result = fitted(toy_trials(2), ParameterSpace(), ToySimulator(), RandomSearch(4, 1), budget=20)
+    return result, confirmed(result, OPTIONS, engines(second))
 
 
 def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
@@ -73,10 +73,8 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
 
 
-def test_it_costs_time_and_no_evaluation():
-    now = iter(range(100))
-    before, after = found(SecondToy(), clock=lambda: float(next(now)))
-    assert after.seconds == before.seconds + 1
+def test_it_costs_no_evaluation():
+    before, after = found(SecondToy())
     assert after.simulations == before.simulations
 
 
@@ -110,7 +108,7 @@ def test_a_second_engine_that_fails_leaves_the_result_with_a_warning():
     before, after = found(SecondToy(failure=SimulationError('the rollout diverged')))
     assert after.confirmation is None
     assert after.values == before.values
-    assert after.warnings == ('not confirmed by engine second toy: the rollout diverged',)
+    assert after.warnings == ('not confirmed by engine bullet: the rollout diverged',)
 
 
 def engines(second):
@@ -120,17 +118,17 @@ def engines(second):
 
 def test_auto_confirms_and_a_named_engine_does_not():
     trials = toy_trials(1)
-    result = calibrate_with(trials, OPTIONS, engines(SecondToy(0.001)))
+    result = calibrate(trials, OPTIONS, make_simulator=engines(SecondToy(0.001)))
     assert (result.engine, result.confirmation.engine) == ('toy', 'second toy')
     named = Options.of({**OPTIONS.flat(), 'engine': 'compiled'})
-    assert calibrate_with(trials, named, engines(SecondToy(0.001))).confirmation is None
+    assert calibrate(trials, named, make_simulator=engines(SecondToy(0.001))).confirmation is None
     # Where auto is PyBullet already, it is not asked twice.
-    assert calibrate_with(trials, OPTIONS, lambda _: SecondToy()).confirmation is None
+    assert calibrate(trials, OPTIONS, make_simulator=lambda _: SecondToy()).confirmation is None
 
 
 @pytest.mark.parametrize('failure', [RuntimeError('broken\nhere'), MemoryError()])
 def test_a_second_engine_that_breaks_does_not_lose_the_result(failure):
-    result = calibrate_with(toy_trials(1), OPTIONS, engines(SecondToy(failure=failure)))
+    result = calibrate(toy_trials(1), OPTIONS, make_simulator=engines(SecondToy(failure=failure)))
     assert result.confirmation is None
     assert 'not confirmed by engine bullet: ' + type(failure).__name__ in result.warnings[-1]
     assert '\n' not in result.warnings[-1]
@@ -141,7 +139,7 @@ def test_a_second_engine_that_cannot_be_made_does_not_lose_the_result():
         if options.engine == 'bullet':
             raise ImportError('no pybullet')
         return ToySimulator()
-    assert 'no pybullet' in calibrate_with(toy_trials(1), OPTIONS, make).warnings[-1]
+    assert 'no pybullet' in calibrate(toy_trials(1), OPTIONS, make_simulator=make).warnings[-1]
 
 
 def test_pybullet_is_not_made_again_to_confirm_itself():
@@ -150,25 +148,27 @@ def test_pybullet_is_not_made_again_to_confirm_itself():
     class Bullet(ToySimulator):
         name = 'bullet'
 
-    calibrate_with(toy_trials(1), OPTIONS, lambda options: asked.append(options) or Bullet())
+    calibrate(toy_trials(1), OPTIONS, make_simulator=lambda options: asked.append(options) or Bullet())
     assert len(asked) == 1
 
 
 def test_a_stopped_search_is_confirmed_too():
     count = []
-    result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy(0.001)), count.append,
-                            lambda: len(count) >= 3)
+    result = calibrate(toy_trials(2), OPTIONS,
+                       make_simulator=engines(SecondToy(0.001)), on_evaluation=count.append,
+                       should_stop=lambda: len(count) >= 3)
     assert len(result.evaluations) == 3
     assert result.confirmation.mean_distance == pytest.approx(0.001)
 
 
 def test_a_confirmation_that_takes_too_long_after_a_stop_is_given_up(monkeypatch):
-    monkeypatch.setattr('dlo_calibration.calibration.worker.STOPPED_PATIENCE', -1.0)
+    monkeypatch.setattr('dlo_calibration.calibration.stages.STOPPED_PATIENCE', -1.0)
     count = []
-    result = calibrate_with(toy_trials(2), OPTIONS, engines(SecondToy()), count.append,
-                            lambda: len(count) >= 3)
+    result = calibrate(toy_trials(2), OPTIONS,
+                       make_simulator=engines(SecondToy()), on_evaluation=count.append,
+                       should_stop=lambda: len(count) >= 3)
     assert result.confirmation is None
-    assert result.warnings == ('not confirmed by engine second toy: stopped on request',)
+    assert result.warnings == ('not confirmed by engine bullet: stopped on request',)
 
 
 @pytest.fixture

@@ -5,10 +5,13 @@
 
 from dataclasses import replace
 
+from fitting import fitted
 import pytest
 from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
 
-from dlo_calibration.calibration.calibrate import calibrate, explained
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.calibration.stages import with_missing_parameters
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.report.sentences import sentences, values
@@ -18,8 +21,8 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 def found(trials, space=EVEN):
     simulator = CompiledSimulator(table=False)
-    result = calibrate(trials, space, simulator, LeastSquares(space.dimension, 1), budget=80)
-    return explained(result, simulator)
+    result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=80)
+    return with_missing_parameters(Setting(result.trials, Options(), simulator), result)
 
 
 @pytest.mark.parametrize('name, value', [('natural_curvature', 15.0), ('length_scale', 70.0)])
@@ -57,5 +60,6 @@ def test_nothing_is_named_that_would_not_help():
 def test_a_stop_leaves_the_result_as_it_is():
     trials = observed(ParameterSpace((*EVEN.free, 'length_scale')), {**TRUTH, 'length_scale': 40.0})
     simulator = CompiledSimulator(table=False)
-    result = calibrate(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=80)
-    assert explained(result, simulator, should_stop=lambda: True) is result
+    result = fitted(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=80)
+    setting = Setting(result.trials, Options(), simulator, should_stop=lambda: True)
+    assert with_missing_parameters(setting, result) is result

@@ -9,17 +9,17 @@ import math
 import numpy as np
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs
 
 
 @pytest.fixture(scope='module')
 def result():
     """Return what the toy finds; its optimum is the truth."""
-    found = calibrate_with(toy_trials(2), Options.of({'workers': 1}), lambda _: ToySimulator())
+    found = calibrate(toy_trials(2), Options.of({'workers': 1}), make_simulator=new_toy)
     assert found.values == pytest.approx(TRUTH, abs=1.0)
     return found
 

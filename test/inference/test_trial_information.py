@@ -5,11 +5,12 @@
 
 from dataclasses import replace
 
+from fitting import fitted
 import numpy as np
 import pytest
 from toy_simulator import REACH, toy_trial, ToySimulator
 
-from dlo_calibration import calibrate, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError
+from dlo_calibration import Chain, Goal, Hand, SimulationError
 from dlo_calibration.inference.trial_information import (
     covers,
     Gain,
@@ -20,7 +21,9 @@ from dlo_calibration.inference.trial_information import (
     told_by,
 )
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import SEARCHES
+from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
 SPACE = ParameterSpace(('flexibility', 'friction'), {'elasticity': 30.0, 'self_collision': 20.0})
@@ -153,7 +156,7 @@ def noisy_trial(name, seed):
 
 def calibrated(simulator, *names):
     trials = [noisy_trial(name, seed) for seed, name in enumerate(names)]
-    return calibrate(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
+    return fitted(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
 
 
 def test_after_a_result_the_next_trial_adds_to_what_it_found():

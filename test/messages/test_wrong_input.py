@@ -14,12 +14,11 @@ from live import live_node, LOG_WARN, QUICK
 import pytest
 from test_collector import contents
 from toy_messages import SECOND, session_messages, write_session
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy
 from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRONG
 
-from dlo_calibration import InputError
+from dlo_calibration import calibrate, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.session import decode, encode, read_session, Record, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
@@ -97,7 +96,7 @@ def good_score():
 
 
 def score_of(trials):
-    return calibrate_with(trials, Options.of(QUICK), lambda _: ToySimulator()).best.score
+    return calibrate(trials, Options.of(QUICK), make_simulator=new_toy).best.score
 
 
 # ---- messages

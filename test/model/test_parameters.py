@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from dlo_calibration import InputError, PARAMETERS, ParameterSpace
-from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration import InputError
+from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, ParameterSpace
 
 PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
 WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known

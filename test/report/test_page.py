@@ -17,10 +17,10 @@ import numpy as np
 from PIL import Image
 import pytest
 from toy_messages import toy_trials
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.slices import cut
@@ -40,7 +40,7 @@ def result():
     """Return what the toy finds from three trials, one of which has a name that HTML must not take."""
     first, second, third = toy_trials(3)
     trials = (replace(first, name='<b>first</b> & "only"'), second, third)
-    return calibrate_with(trials, OPTIONS, lambda _: ToySimulator())
+    return calibrate(trials, OPTIONS, make_simulator=new_toy)
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_slices_are_drawn_or_said_to_be_left_out(result, page):
 
 def test_of_many_trials_the_worst_are_drawn(page):
     trials = toy_trials(MOST_TRIALS + 3)
-    result = calibrate_with(trials, replace(OPTIONS, evaluations=20), lambda _: ToySimulator())
+    result = calibrate(trials, replace(OPTIONS, evaluations=20), make_simulator=new_toy)
     text = page(result)
     assert text.count('Seen from above') == 2 * MOST_TRIALS  # the title and its description
     for trial in trials:

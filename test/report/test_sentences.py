@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.report.sentences import interval_text, physical_text, plain, sentences
 
@@ -18,7 +18,7 @@ from dlo_calibration.report.sentences import interval_text, physical_text, plain
 @pytest.fixture(scope='module')
 def result():
     """Return what the toy finds; the mass is known."""
-    return calibrate_with(toy_trials(2), Options.of({'workers': 1, 'mass': 0.05}), lambda _: ToySimulator())
+    return calibrate(toy_trials(2), Options.of({'workers': 1, 'mass': 0.05}), make_simulator=new_toy)
 
 
 @pytest.mark.parametrize('value, text', [
@@ -60,7 +60,7 @@ def test_what_is_known_well_comes_first_and_what_is_not_is_no_value(result):
 
 def test_stiffness_per_weight_is_explained():
     options = Options.of({'workers': 1, 'evaluations': 20})
-    found = calibrate_with(toy_trials(1), options, lambda _: ToySimulator())
+    found = calibrate(toy_trials(1), options, make_simulator=new_toy)
     assert any('mass was not given' in text for text in sentences(found))
 
 

@@ -6,13 +6,13 @@
 from dataclasses import replace
 import math
 
+from fitting import fitted
 import numpy as np
 import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import toy_trial, ToySimulator
 from wire import wire
 
-from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, INSTANTS
@@ -26,7 +26,7 @@ LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 4, 5, 7, 9
 
 @pytest.fixture(scope='module')
 def result():
-    return calibrate(toy_trials(2), ParameterSpace(), ToySimulator(), RandomSearch(4, seed=1), budget=5)
+    return fitted(toy_trials(2), ParameterSpace(), ToySimulator(), RandomSearch(4, seed=1), budget=5)
 
 
 def shown(types, trials, result=None):

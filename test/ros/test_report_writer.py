@@ -7,10 +7,10 @@ import threading
 
 import pytest
 from toy_messages import toy_trials
-from toy_simulator import ToySimulator
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import calibrate_with
 from dlo_calibration.report.page import Origin
 from dlo_calibration.ros.report_writer import Reporter
 
@@ -21,7 +21,7 @@ ORIGIN = Origin('session', 'a command', OPTIONS)
 @pytest.fixture(scope='module')
 def result():
     """Return what the toy finds."""
-    return calibrate_with(toy_trials(2), OPTIONS, lambda _: ToySimulator())
+    return calibrate(toy_trials(2), OPTIONS, make_simulator=new_toy)
 
 
 def test_page_has_slices_simulated_elsewhere(result, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.worker import hints as known_from
+from dlo_calibration.calibration.prior import prior
 from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Hints, LeastSquares, Observation
@@ -156,7 +156,7 @@ def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_pl
     options = Options.of(session.options or {})
     trials, _ = session_trials(session, options)
     evaluator = Evaluator(trials, options.space, CompiledSimulator())
-    search = LeastSquares(options.space.dimension, 10, known_from(trials, options))
+    search = LeastSquares(options.space.dimension, 10, prior(trials, options).hints)
     while len(points := search.ask(150)):
         search.tell([Observation(e.point, e.score, e.residuals)
                      for e in (evaluator.evaluate(0, point) for point in points)])

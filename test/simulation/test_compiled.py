@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from test_rod import crumpled, GRAVITY, straight
 
-from dlo_calibration import Chain, PARAMETERS, ParameterSpace, SimulationError
+from dlo_calibration import Chain, SimulationError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator

@@ -14,7 +14,8 @@ import pytest
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
-from dlo_calibration import Action, Chain, Goal, Hand, PARAMETERS, ParameterSpace, SimulationError, Trial
+from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
+from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 

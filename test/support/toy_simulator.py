@@ -13,10 +13,11 @@ from typing import Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration import Action, Chain, Goal, Hand, ParameterSpace, Rollout, SimulationError, Trial
+from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
 from dlo_calibration.evaluation.evaluation import mean_length
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.simulation.protocol import Rollout
 
 REACH = 0.2  # m that a parameter moves the points that it moves most, from 0 to 100
 
@@ -98,3 +99,8 @@ def toy_trial(values: Mapping[str, float], name: str = 'trial 1', n: int = 11, t
     physical = ParameterSpace().physical(values, mean_length([draft]))
     return Trial(name, draft.initial, draft.actions,
                  (Goal(Chain(toy_goal(initial, draft.hands, physical)), 2.0),))
+
+
+def new_toy(_):
+    """Return a toy, whatever the options are."""
+    return ToySimulator()

@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The fit: a search within its budget, and the evaluation that it ends with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.inference.examination import Examination
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.search import Observation, Search
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    Where a search has ended.
+
+    :param search: its name.
+    :param best: the evaluation that the search calls the best.
+    :param evaluations: all of them, without residuals.
+    :param ended: why it ended, in words.
+    :param stopped: whether somebody asked to stop.
+    :param examination: of the surroundings of the best; None where there was no time for it.
+    :param parts: how the number of parts was chosen, in words; empty where it was given.
+    """
+
+    space: ParameterSpace
+    search: str
+    best: Evaluation
+    evaluations: tuple[Evaluation, ...]
+    ended: str
+    stopped: bool = False
+    examination: Examination | None = None
+    parts: str = ''
+
+    @property
+    def stop_reason(self) -> str:
+        """Why the calibration ended, in words."""
+        return '; '.join(filter(None, ('stopped on request' if self.stopped else self.ended, self.parts)))
+
+    @property
+    def examined(self) -> int:
+        """How many parameter sets were simulated around the best; 0 where there was no time for it."""
+        return 0 if self.examination is None else self.examination.evaluations
+
+
+def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
+    """
+    Let a search evaluate parameter sets until it has finished, its budget is spent, or it is stopped.
+
+    The outcome does not depend on where evaluations are simulated: the search is told in the order asked.
+
+    :param budget: number of evaluations.
+    :param first: index of the first of them.
+    :raises SimulationError: where no evaluation could be simulated.
+    """
+    evaluate = setting.evaluate(space)
+    kept: list[Evaluation] = []
+    best: Evaluation | None = None
+    stopped = False
+    while len(kept) < budget and not stopped:
+        points = search.ask(budget - len(kept))
+        if not len(points):
+            break
+        batch: list[Evaluation] = []
+        for evaluation in evaluate(points, first + len(kept)):
+            batch.append(evaluation)
+            setting.on_evaluation(evaluation)
+        stopped = len(batch) < len(points)
+        search.tell([Observation(one.point, one.score, one.residuals) for one in batch])
+        best = _better(best, batch, search)
+        kept.extend(replace(evaluation, residuals=None) for evaluation in batch)
+    if best is None:
+        raise SimulationError('stopped before the first evaluation had finished')
+    if not best.scores:
+        raise SimulationError(f'none of {len(kept)} evaluations could be simulated: {best.failure}')
+    ended = search.stop_reason or f'budget of {budget} evaluations spent'
+    return Fit(space, search.name, best, tuple(kept), ended, stopped)
+
+
+def _better(best: Evaluation | None, batch: list[Evaluation], search: Search) -> Evaluation | None:
+    """Return the evaluation that the search calls the best; while there is none, that of lowest score."""
+    chosen = search.best
+    for one in batch:
+        if best is None or best.residuals is None and one.score < best.score or (
+                one.residuals is not None and chosen is not None and np.array_equal(one.point, chosen)):
+            best = one
+    return best

@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The setting of a calibration: what all its stages share."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Callable
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.protocol import Simulator
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    What all stages of a calibration share.
+
+    :param trials: to calibrate on, at least one.
+    :param simulator: the engine, which belongs to this thread.
+    :param executor: where evaluations are simulated; None: in this thread, one after the other.
+    :param should_stop: asked often; once True, every stage ends with what it has.
+    :param on_evaluation: called with each finished evaluation of the search, in the order asked.
+    """
+
+    trials: tuple[Trial, ...]
+    options: Options
+    simulator: Simulator
+    executor: Executor | None = None
+    should_stop: Callable[[], bool] = lambda: False
+    on_evaluation: Callable[[Evaluation], None] = lambda _: None
+
+    @property
+    def chooses_parts(self) -> bool:
+        """Whether the number of parts is to be found, and can be: by cross-validation over the trials."""
+        return self.options.parts == 0 and len(self.trials) > 1 and 'flexibility' in self.options.calibrate
+
+    def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
+                 simulator: Simulator | None = None) -> Everywhere:
+        """Return what evaluates points of a space, on the trials with the engine unless others are given."""
+        evaluator = Evaluator(trials or self.trials, space, simulator or self.simulator)
+        return Everywhere(evaluator, self.should_stop, self.executor)

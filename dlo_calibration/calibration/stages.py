@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The stages after the fit: advice, missing parameters, confirmation. None of them changes what was found."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+from contextlib import closing
+from dataclasses import replace
+import time
+from typing import Callable
+
+import numpy as np
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
+from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.errors import DloCalibrationError, SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.inference.advice import advise
+from dlo_calibration.inference.confirmation import Confirmation, disagreements
+from dlo_calibration.inference.missing_parameters import explanations
+from dlo_calibration.inference.slices import cut, Slices
+from dlo_calibration.inference.uncertainty import MODEL_ERROR
+from dlo_calibration.simulation.protocol import Simulator
+
+STOPPED_PATIENCE = 5.0  # s that a confirmation may still take once it was asked to stop
+
+
+def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
+    """Return a result with the action that would tell most, if its uncertainty is known."""
+    if result.examination is None or not result.examination.regular:
+        return result
+    return replace(result, advice=advise(
+        result.trials, result.space, setting.simulator, result.best.point, result.examination.uncertainty,
+        result.length, setting.should_stop))
+
+
+def with_missing_parameters(setting: Setting, result: CalibrationResult) -> CalibrationResult:
+    """
+    Return a result with the parameters that were held fixed and would explain what the fit leaves over.
+
+    Each of them is simulated once, and only where the residuals are larger than the noise.
+    """
+    found, best = result.examination, result.best
+    if found is None or not found.regular or best.residuals is None or (
+            found.uncertainty.residual < MODEL_ERROR * found.noise):
+        return result
+    try:
+        return replace(result, explanations=explanations(
+            result.trials, result.space, setting.simulator, best.point, best.residuals, found.jacobian,
+            setting.should_stop))
+    except CancelledError:
+        return result
+
+
+def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
+              should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
+    """
+    Return a result with what a second engine gives, where `options` leave the choice of the engine open.
+
+    It costs one evaluation. Whatever the second engine does, the result is not lost: where the engines
+    disagree, or the second one fails, it stands, with a warning.
+    """
+    if options.engine != AUTO or result.engine == CONFIRMING:
+        return result
+    begun = time.monotonic()
+
+    def late() -> bool:
+        return should_stop() and time.monotonic() - begun > STOPPED_PATIENCE
+
+    try:
+        with closing(make_simulator(replace(options, engine=CONFIRMING))) as simulator:
+            return result if simulator.name == result.engine else _confirmed(result, simulator, late)
+    except CancelledError:
+        words = 'stopped on request'
+    except DloCalibrationError as error:
+        words = str(error)
+    except Exception as error:
+        words = ' '.join(f'{type(error).__name__}: {error}'.split())
+    return replace(result, warnings=(*result.warnings, f'not confirmed by engine {CONFIRMING}: {words}'))
+
+
+def _confirmed(result: CalibrationResult, simulator: Simulator,
+               should_stop: Callable[[], bool]) -> CalibrationResult:
+    best = result.best
+    other = Evaluator(result.trials, result.space, simulator).evaluate(best.index, best.point, should_stop)
+    if other.errors is None:
+        raise SimulationError(other.failure)
+    chains = simulated_chains(result.trials, other)
+    apart = np.concatenate([np.linalg.norm(one - two, axis=2).ravel()
+                            for one, two in zip(result.chains, chains, strict=True)])
+    confirmation = Confirmation(simulator.name, other.score, other.scores, other.errors,
+                                float(apart.mean()), float(apart.max()))
+    found = disagreements([trial.name for trial in result.trials], result.chains, chains, best.scores,
+                          other.scores)
+    warnings = result.warnings
+    if found:
+        warnings += f'engine {simulator.name} disagrees with engine {result.engine}: {"; ".join(found)}',
+    return replace(result, confirmation=confirmation, warnings=warnings)
+
+
+def sliced(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
+           should_stop: Callable[[], bool] = lambda: False) -> Slices | None:
+    """
+    Simulate slices around a result, in this thread; None where the engine fails.
+
+    They may be coarse, as the time for them is short: see `slices.cut`.
+    """
+    try:
+        with closing(make_simulator(options)) as simulator:
+            return cut(result, simulator, should_stop)
+    except Exception:  # whatever the engine does, there is a page
+        return None

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The surroundings of a fit: what is simulated around the best parameter set, so that its intervals hold."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from typing import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.calibration.fit import Fit
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.inference.examination import Examination, examine
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
+from dlo_calibration.search.huber import Huber
+
+UNLIKELY = 2.71  # chi-square, one degree of freedom, that 10 % exceed
+FURTHEST = 0.1  # that excited parameters follow those that are set to their default, in the unit cube
+STARTS = 16  # initial chains that are simulated with other noise, over all trials
+
+
+def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
+    """
+    Return a fit with the examination of its surroundings, and with its best evaluation as it is reported.
+
+    A parameter that no trial shows gets its default instead of what it had by chance, unless the
+    trials refute the default. A fit that was stopped, before or now, has no examination.
+
+    :param thorough: False: only what cross-validation needs; the intervals are not to be used then.
+    """
+    if fit.stopped:
+        return replace(fit, examination=None)
+    try:
+        examination, best = _examined(setting, fit, thorough)
+    except CancelledError:
+        return replace(fit, examination=None, stopped=True)
+    count = examination.evaluations + fit.examined
+    return replace(fit, best=best, examination=replace(examination, evaluations=count))
+
+
+def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, Evaluation]:
+    """
+    Return the examination, and the best evaluation as it is reported.
+
+    :raises CancelledError: when stopped.
+    """
+    trials, space, best = setting.trials, fit.space, fit.best
+    assert best.residuals is not None
+    default, sigma = space.default_point(), noise(trials)
+    finer = setting.simulator.refined() if thorough else None
+    noisy = thorough and sigma > NO_NOISE and 'length_scale' not in space.free
+    evaluate = setting.evaluate(space)
+    try:
+        examination = examine(
+            best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
+            evaluate.residuals, default=default, noise=sigma,
+            finer=None if finer is None else setting.evaluate(space, simulator=finer).residuals,
+            starts=[setting.evaluate(space, others).residuals
+                    for others in _other_starts(trials, sigma)] if noisy else [], thorough=thorough)
+    finally:
+        if finer is not None:
+            finer.close()
+    excited = examination.uncertainty.excited
+    point = np.where(excited, best.point, default)
+    if np.array_equal(point, best.point):
+        return examination, best
+    points = np.stack([point, _moved_along(point, best, examination.jacobian, excited)])
+    seen = list(evaluate(points, best.index))
+    if len(seen) < len(points):
+        raise CancelledError
+    loss = Huber.of(best.residuals)
+    again = replace(min(seen, key=lambda one: loss.cost(one.residuals)), index=best.index)
+    examination = replace(examination, evaluations=examination.evaluations + len(points))
+    found = examination.uncertainty
+    # The cost is half the sum of squares.
+    worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / found.scale**2
+    if worse > UNLIKELY * int((point != best.point).sum()):  # what was found stays, unknown as it is
+        found = replace(found, excited=excited | (point != best.point))
+        return replace(examination, uncertainty=found), best
+    return examination, again
+
+
+def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDArray[np.bool_]) -> Floats:
+    """Return the (d,) point where the excited parameters have followed the others, by a Gauss-Newton step."""
+    assert best.residuals is not None
+    roots = Huber.of(best.residuals).roots(best.residuals)
+    after = roots * (best.residuals + jacobian @ (point - best.point))
+    step = np.linalg.lstsq(roots[:, None] * jacobian[:, excited], -after, rcond=None)[0]
+    moved = np.array(point)
+    moved[excited] = np.clip(point[excited] + np.clip(step, -FURTHEST, FURTHEST), 0.0, 1.0)
+    return moved
+
+
+def _other_starts(trials: Sequence[Trial], sigma: float) -> list[tuple[Trial, ...]]:
+    """
+    Return copies of the trials whose initial chains have other noise, a few if there are many trials.
+
+    It is drawn anew onto the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
+    Introduction to the Bootstrap, 1993, 6.5); the same draws each time.
+
+    :param sigma: standard deviation of a coordinate [m].
+    """
+    generator = np.random.default_rng(0)
+
+    def drawn(initial: Chain) -> Chain:
+        points = smooth(initial.points, sigma)
+        return replace(initial, points=points + generator.normal(0, sigma, points.shape))
+
+    return [tuple(replace(trial, initial=drawn(trial.initial)) for trial in trials)
+            for _ in range(-(-STARTS // len(trials)))]
