@@ -21,7 +21,6 @@ from figures import SAMPLES, table, write
 import numpy as np
 
 from dlo_calibration import SimulationError, Trial
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
@@ -45,7 +44,7 @@ def reference_trials() -> list[tuple[str, float, Trial]]:
             found += [(name, properties['mass'], trial) for trial in trials]
         else:
             session = read_session(SAMPLES / name)
-            options = Options.of(session.options)
+            options = session.options
             found += [(name, options.mass, trial) for trial in session_trials(session, options)[0]]
     return found
 

@@ -13,7 +13,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
-from dlo_calibration.files.session import encode, read_session, SessionWriter
+from dlo_calibration.files.bag import encode
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, status
 

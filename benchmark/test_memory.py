@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from dlo_calibration import SimulationError
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.files.session import read_session, session_trials
 
@@ -34,7 +33,7 @@ def memory(name, rounds):
     else:
         from dlo_calibration.simulation.bullet import BulletSimulator as Engine
     session = read_session(SAMPLES / 'object1')
-    options = Options.of(session.options)
+    options = session.options
     trials, _ = session_trials(session, options)
     simulator, generator, looks = Engine(), np.random.default_rng(1), []
     for k in range(rounds):

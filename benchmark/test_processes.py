@@ -50,7 +50,7 @@ def processes():
 def sample():
     """Return trials and parameter space of object 1."""
     session = read_session(SAMPLES / 'object1')
-    options = Options.of(session.options)
+    options = session.options
     return session_trials(session, options)[0], options.space
 
 

@@ -9,7 +9,6 @@ from figures import SAMPLES, side_by_side, table, write
 import numpy as np
 import pytest
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
@@ -26,7 +25,7 @@ HOW = ('Object 1; a settled round is one trial simulated until the DLO has come 
 def object1():
     """Return the four trials of object 1 and its physical parameters."""
     session = read_session(SAMPLES / 'object1')
-    options = Options.of(session.options)
+    options = session.options
     trials, _ = session_trials(session, options)
     return trials, options.space.physical(VALUES, trials[0].initial.length)
 

@@ -65,7 +65,7 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.setdefault('ROS_LOG_DIR', str(output.resolve() / 'ros_log'))
     before = set(output.glob('dlo_session_*'))
-    options = {**(session.options or {}), 'evaluations': evaluations,
+    options = {**(session.recorded or {}), 'evaluations': evaluations,
                'output_directory': str(output.resolve())}
     out = terminal.console(sys.stdout)
     with _node(options, output / LOG) as child, _robot(child, output / LOG, stop) as robot:

@@ -160,7 +160,7 @@ def _read(chosen: argparse.Namespace, note: Callable[[str], None],
     request = read_request(path) if _is_request(path) else None
     session = read_session(path, chosen.namespace) if request is None else \
         Session(path, (), (), dict(request.options), ())
-    recorded = session.options or {}
+    recorded = session.recorded or {}
     if of_result:
         observed = {name: value for name, value in recorded.items() if name in OF_THE_SESSION}
         recorded = {**of_result, **observed}
@@ -410,7 +410,7 @@ def _write_session(path: Path, source: Path, found: _Input) -> None:
         if len(files) == 1 and files[0].suffix == '.mcap':
             _copy(files[0], path)
             return
-        records, options = found.session.records, found.session.options
+        records, options = found.session.records, found.session.recorded
         if _is_request(source):
             records, options = trial_records(found.trials), found.options.flat()
         writer = SessionWriter(path.with_name(f'{path.name}.new'), options)
@@ -474,7 +474,7 @@ def _about(found: _Input) -> dict[str, Any]:
     duration = (records[-1].log_time - records[0].log_time) / 1e9 if records else 0.0
     return {
         'session': str(found.session.path), 'duration_s': duration, 'frames': frames,
-        'messages': dict(sorted(counts.items())), 'options': found.session.options,
+        'messages': dict(sorted(counts.items())), 'options': found.session.recorded,
         'trials': [_about_trial(trial) for trial in found.trials],
         'refusals': list(found.refusals), 'problems': list(found.session.problems)}
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +57,7 @@ def trials_of(data, *arguments):
     kind, source, *rest = arguments
     assert convert.main(['--data', str(data), kind, source, str(data / 'out'), *rest]) == 0
     session = read_session(data / 'out')
-    options = Options.of(session.options)
+    options = session.options
     trials, refusals = session_trials(session, options)
     assert (session.problems, refusals) == ((), ())
     return trials, options

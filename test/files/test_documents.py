@@ -60,16 +60,15 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     """Execute the three lines of README on a result that was fitted and written."""
     import pybullet
 
-    from dlo_calibration.calibration.options import Options
     from dlo_calibration.files.result import read_result, write_result
-    from dlo_calibration.files.session import read_session, session_trials
+    from dlo_calibration.files.session import read_session
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.parameters import ParameterSpace
     from dlo_calibration.search import LeastSquares
     from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
 
     session = read_session(ROOT / 'msg_samples/object1')
-    trials, _ = session_trials(session, Options.of(session.options))
+    trials = session.trials
     simulator = BulletSimulator()
     result = fitted(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
     simulator.close()

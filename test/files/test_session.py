@@ -25,7 +25,9 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.session import encode, read_session, RecordingError, session_trials, SessionWriter
+from dlo_calibration.files.bag import encode
+from dlo_calibration.files.recording import RecordingError, SessionWriter
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -157,7 +159,7 @@ def test_mcap_ros2_reads_what_we_write(session):
 def test_own_session_round_trip(session, what):
     found = read_session(session if what == 'folder' else mcap(session))
     assert content(found.messages) == EXPECTED
-    assert found.options == {'mass': 0.03}
+    assert found.recorded == {'mass': 0.03}
     assert found.problems == ()
     assert [one.status[0].name for one in found.outputs('status')] == ['status']
 
@@ -175,7 +177,7 @@ def test_bag_by_rosbags(tmp_path, storage, mode, version):
             writer.write(topics[kind], log_time, encode(message, INPUT_TYPES[kind]))
     found = read_session(tmp_path / 'bag')
     assert content(found.messages) == EXPECTED
-    assert found.options is None and found.problems == ()
+    assert found.recorded is None and found.problems == ()
 
 
 def test_db3_file_without_its_folder(tmp_path):
@@ -339,7 +341,7 @@ def test_cut_session_says_so(tmp_path, session):
     os.truncate(file, sixth.chunk_start_offset + sixth.chunk_length // 2)
     found = read_session(folder)
     assert content(found.messages) == EXPECTED[:5]
-    assert found.options == {'mass': 0.03}
+    assert found.recorded == {'mass': 0.03}
     problem, = found.problems
     assert 'cut' in problem and file.name in problem
 
@@ -424,7 +426,7 @@ def test_all_options_come_back_and_the_last_ones_count(tmp_path):
     with SessionWriter(tmp_path / 'session', Options().flat()) as writer:
         write(writer)
         writer.write_options(options.flat())
-    assert Options.of(read_session(writer.path).options) == options
+    assert read_session(writer.path).options == options
 
 
 def test_replay_stands_on_what_the_calibration_stood_on(tmp_path):
@@ -477,9 +479,10 @@ def test_killed_process_loses_nothing_that_was_written(tmp_path, session):
     program = f"""
 import os, signal
 from pathlib import Path
-from dlo_calibration.files.session import SessionWriter, read_session
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.session import read_session
 source = read_session({str(session)!r})
-writer = SessionWriter(Path({str(tmp_path)!r}) / 'killed', source.options)
+writer = SessionWriter(Path({str(tmp_path)!r}) / 'killed', source.recorded)
 for record in source.records:
     writer.write(record.topic, record.type, record.data, record.log_time)
 os.kill(os.getpid(), signal.SIGKILL)
@@ -488,7 +491,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert done.returncode == -signal.SIGKILL
     found = read_session(tmp_path / 'killed')
     assert content(found.messages) == EXPECTED
-    assert found.options == {'mass': 0.03}
+    assert found.recorded == {'mass': 0.03}
     assert len(found.problems) == 1
 
 
@@ -558,7 +561,7 @@ def test_one_bad_message_costs_no_trial(tmp_path):
 @pytest.mark.parametrize('number', range(1, 6))
 def test_sample_sessions_are_usable(number):
     found = read_session(SAMPLES / f'object{number}')
-    trials, refusals = session_trials(found, Options.of(found.options))
+    trials, refusals = session_trials(found, found.options)
     assert (found.problems, refusals) == ((), ())
     assert [len(trial.hands) for trial in trials] == [1, 1, 1, 2]
     assert [goal.held_by for trial in trials for goal in trial.goals] == [

@@ -263,7 +263,8 @@ def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, co
 WRITER = """
 import os, random, signal, sys, time
 from pathlib import Path
-from dlo_calibration.files.session import SessionWriter, read_session
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.session import read_session
 source = read_session(sys.argv[1]).records
 for turn in range(int(sys.argv[3])):
     folder = Path(sys.argv[2]) / f'{turn:02d}'

@@ -10,7 +10,7 @@ import pytest
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.request import read_request, request_trials
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.action import Action, Hand
@@ -53,7 +53,7 @@ def assert_same(found, trials):
 @pytest.mark.parametrize('name', ['object1', 'object4', 'object5'])
 def test_trials_of_a_session_are_the_same_again(name):
     session = read_session(SAMPLES / name)
-    trials, _ = session_trials(session, Options.of(session.options))
+    trials = session.trials
     assert_same(collected(trials), trials)
 
 

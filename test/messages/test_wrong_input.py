@@ -19,8 +19,9 @@ from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRO
 
 from dlo_calibration import calibrate, InputError
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.bag import decode, encode, Record
 from dlo_calibration.files.recording import SessionWriter
-from dlo_calibration.files.session import decode, encode, read_session, Record, session_trials
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 

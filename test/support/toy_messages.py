@@ -7,8 +7,8 @@ import numpy as np
 from toy_simulator import toy_trial
 
 from dlo_calibration import Trial
+from dlo_calibration.files.bag import encode
 from dlo_calibration.files.recording import SessionWriter
-from dlo_calibration.files.session import encode
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,

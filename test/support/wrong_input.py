@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import numpy as np
 from toy_messages import MINUTE, SECOND, toy_trials, trial_messages
 
-from dlo_calibration.files.session import encode
+from dlo_calibration.files.bag import encode
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
