@@ -24,10 +24,9 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from dlo_calibration.calibration.options import Options  # noqa: E402
-from dlo_calibration.files.session import read_session, session_trials  # noqa: E402
+from dlo_calibration.files.session import read_session  # noqa: E402
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace  # noqa: E402
-from dlo_calibration.observation.estimate import estimate  # noqa: E402
+from dlo_calibration.observation.estimate import prior_estimates  # noqa: E402
 
 DATA = Path(os.environ.get('DLO_DATA', HERE.parent / '../shared/data'))
 PROPERTIES = {'flexibility': 'EI', 'elasticity': 'EA', 'friction': 'mu', 'self_collision': 'radius'}
@@ -36,24 +35,23 @@ PROPERTIES = {'flexibility': 'EI', 'elasticity': 'EA', 'friction': 'mu', 'self_c
 def rows(name: str, path: Path, truth: dict[str, float]) -> list[str]:
     """Return the rows of one session; `truth` has physical values by parameter."""
     session = read_session(path)
-    options = Options.of({**Options().flat(), **(session.options or {})})
-    trials, _ = session_trials(session, options)
+    options, trials = session.options, session.trials
     space = ParameterSpace(free=tuple(truth), mass=options.mass)
     start = time.perf_counter()
-    found = estimate(trials, space, options.table_height if options.table else None)
+    found = prior_estimates(trials, space, options.table_height if options.table else None)
     seconds = time.perf_counter() - start
     table = []
-    for key, one in found.parameters.items():
+    for key, one in found.items():
         value = '-' if np.isnan(one.value) else f'{one.value:.1f}'
         table.append(f'| {name} | {key} | {BY_NAME[key].value(truth[key]):.1f} | {value} '
-                     f'| {one.lower:.1f} to {one.upper:.1f} | {one.origin} |')
-    print(f'{name}: noise {found.noise * 1e3:.2f} mm, {seconds * 1e3:.0f} ms')
+                     f'| {one.lower:.1f} to {one.upper:.1f} |')
+    print(f'{name}: {seconds * 1e3:.0f} ms')
     return table
 
 
 def main() -> None:
     """Make the table."""
-    table = ['| object | parameter | truth | estimate | range | from |', '|' + '---|' * 6]
+    table = ['| object | parameter | truth | estimate | range |', '|' + '---|' * 5]
     for k in range(1, 6):
         own = json.loads((DATA / 'reference' / f'object{k}.json').read_text())['properties']
         table += rows(f'object{k}', HERE.parent / 'msg_samples' / f'object{k}',

@@ -11,6 +11,8 @@ from typing import Sequence
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.estimate import start_point
+from dlo_calibration.observation.excitation import excites
 from dlo_calibration.search import Hints
 
 #: The height at which the DLO lies tells this radius; no other parameter has a guess where no trial shows it.
@@ -34,12 +36,10 @@ class Prior:
 
 def prior(trials: Sequence[Trial], options: Options) -> Prior:
     """Return what the observed chains alone say of the parameters that `options` ask for."""
-    from dlo_calibration.observation.excitation import priors  # which loads half of SciPy
-
     space = options.space
-    known = priors(trials, space, options.table_height if options.table else None)
-    hints = Hints(known.start, known.lower, known.upper, tuple(int(count) for count in known.rows),
-                  known.excites)
+    height = options.table_height if options.table else None
+    hints = replace(Hints.none(space.dimension), start=start_point(trials, space, height),
+                    excites=excites(trials, space, height))
     default = BY_NAME[GUESSED].default
     if GUESSED not in space.free or space.fixed.get(GUESSED, default) != default:
         return Prior(space, hints)

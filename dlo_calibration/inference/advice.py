@@ -101,7 +101,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
         for candidate in list(possible):
             if should_stop():
                 return None
-            if not excites([candidate.trial], space, np.inf).table[0, k]:  # a table may be anywhere
+            if not excites([candidate.trial], space, np.inf)[0, k]:  # a table may be anywhere
                 continue
             matrix = simulated(candidate, alone)
             if matrix is None:

@@ -25,7 +25,8 @@ from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
-from dlo_calibration.observation.excitation import excites, priors
+from dlo_calibration.observation.estimate import start_point
+from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.simulation.protocol import Simulator
 
@@ -144,7 +145,7 @@ def knowledge(trials: Sequence[Trial], space: ParameterSpace, table_height: floa
     if result is not None:
         point = result.best.point
     else:
-        start = priors(trials, space, table_height).start
+        start = start_point(trials, space, table_height)
         point = np.where(np.isnan(start), space.default_point(), start)
     rough = noise(trials)
     residual = np.hypot(UNKNOWN_NOISE if np.isnan(rough) else rough, MODEL_ERROR)
@@ -189,7 +190,7 @@ def information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator
     :param table_height: [m]; None where there is no table.
     :raises SimulationError: where it cannot be simulated.
     """
-    shown = excites([trial], space, table_height).table[0]
+    shown = excites([trial], space, table_height)[0]
     matrix = sensitivity(glimpse(trial), space, simulator, known.point, known.std, length,
                          shown=shown, at_rest=False)
     return np.asarray(matrix.T @ matrix / known.scale**2)

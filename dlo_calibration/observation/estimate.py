@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimate: what the observed chains alone say of the parameters, before anything is simulated."""
+"""Prior estimates: what the observed chains say of the parameters before anything is simulated."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Mapping, Sequence
+from typing import Sequence
 
 import numpy as np
 
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, MINIMUM_SPACING
-from dlo_calibration.model.parameters import BY_NAME, GRAVITY, measured, ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace, SCALE
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.observation.hanging import Balance, balance, hanging_parts
 from dlo_calibration.observation.noise import noise, smooth
@@ -33,39 +33,21 @@ RADII = 60  # that are tried
 
 
 @dataclass(frozen=True)
-class Estimate:
+class PriorEstimate:
     """
-    What is known of one parameter, on the 0..100 scale.
+    What the observed chains say of one parameter, on the 0..100 scale.
 
-    :param value: nan where there is none.
-    :param lower: the truth is not below, as far as the model holds; 0 where nothing is known.
-    :param upper: nor above; 100 where nothing is known.
-    :param origin: where it came from, in words.
-    """
-
-    name: str
-    value: float
-    lower: float
-    upper: float
-    origin: str
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """
-    What is known of every free parameter.
-
-    :param noise: standard deviation of a coordinate of the chains [m]; nan where it is not known.
+    :param value: nan where they do not tell one.
+    :param lower: the true value is not below it, as far as the model holds; 0 where nothing is known.
+    :param upper: the true value is not above it; 100 where nothing is known.
     """
 
-    parameters: Mapping[str, Estimate]
-    noise: float
+    value: float = math.nan
+    lower: float = 0.0
+    upper: float = SCALE
 
-    def cube(self) -> tuple[Floats, Floats, Floats]:
-        """Return start (nan where there is none), lower and upper, (d,) each, in the unit cube."""
-        table = np.array([(e.value, e.lower, e.upper) for e in self.parameters.values()]) / SCALE
-        start, lower, upper = (frozen_array(column) for column in table.T)
-        return start, lower, upper
+
+UNKNOWN = PriorEstimate()
 
 
 @dataclass(frozen=True)
@@ -85,42 +67,45 @@ class _Resting:
     hold: float
 
 
-def estimate(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Estimates:
+def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
+                    table_height: float | None) -> dict[str, PriorEstimate]:
     """
-    Estimate the free parameters from the chains alone.
+    Estimate the free parameters from the observed chains alone.
 
-    Flexibility and elasticity: from the balance of moments of the parts that hang
-    (see `suspension`), with three standard deviations of the noise and a factor of
-    two either way.  Friction: it holds a DLO bent on the table against its
-    stiffness; a lower bound, a third of what the curve says.  Self-collision
-    radius: parts that are no neighbours were seen no nearer; an upper bound.
-    Damping and mass: nothing.
+    Flexibility and elasticity follow from the balance of moments of the parts that hang
+    (see `hanging`), with three standard deviations of the noise and a factor of two
+    either way. Friction holds a DLO bent on the table against its stiffness: a third of
+    what the curve needs is a lower bound. Parts that are no neighbours were seen no
+    nearer than twice the self-collision radius: an upper bound. The other parameters do
+    not show in chains at rest.
 
     :param table_height: [m]; None where there is no table.
     """
-    seen = noise(trials)
-    sigma = UNKNOWN_NOISE if math.isnan(seen) else max(SMALLEST_NOISE, seen)
+    sigma = noise(trials)
+    sigma = UNKNOWN_NOISE if math.isnan(sigma) else max(SMALLEST_NOISE, sigma)
     length = float(np.median([trial.initial.length for trial in trials]))
     resting = _resting(trials, table_height, sigma)
-    weight = math.nan if 'mass' in space.free else space.physical({}, length)['mass'] / length * GRAVITY
-    known = {'flexibility': _flexibility(resting, weight), 'elasticity': _elasticity(resting, weight),
-             'friction': _friction(resting), 'self_collision': _self_collision(trials, table_height, sigma)}
-    return Estimates({name: known.get(name) or _nothing(name, 'shapes at rest do not tell it')
-                      for name in space.free}, seen)
+    known = {'friction': _friction(resting), 'self_collision': _self_collision(trials, table_height, sigma)}
+    if 'mass' not in space.free:  # chains at rest show stiffness only in proportion to weight
+        weight = space.physical({}, length)['mass'] / length * GRAVITY
+        known |= {'flexibility': _flexibility(resting, weight), 'elasticity': _elasticity(resting, weight)}
+    return {name: known.get(name, UNKNOWN) for name in space.free}
 
 
-def _nothing(name: str, reason: str) -> Estimate:
-    return Estimate(name, math.nan, 0.0, SCALE, reason)
+def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:
+    """Return the (d,) estimates in the unit cube, nan where there is none; the arguments are as above."""
+    found = prior_estimates(trials, space, table_height)
+    return frozen_array([one.value / SCALE for one in found.values()])
 
 
-def _scaled(name: str, value: float, lowest: float, highest: float, origin: str) -> Estimate:
-    """Return an estimate of a physical value > 0, or nan, and of its physical range, within the scale."""
+def _scaled(name: str, value: float, lowest: float, highest: float) -> PriorEstimate:
+    """Return the estimate for a physical value > 0, or nan, and for its physical range, within the scale."""
     def scaled(physical: float) -> float:
         return min(SCALE, max(0.0, BY_NAME[name].value(physical)))
 
     lower, upper = sorted((scaled(lowest), scaled(highest)))
     at = value if math.isnan(value) else min(upper, max(lower, scaled(value)))
-    return Estimate(name, at, lower, upper, origin)
+    return PriorEstimate(at, lower, upper)
 
 
 def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) -> _Resting:
@@ -224,62 +209,42 @@ def _near_itself(points: Floats, places: Floats, sigma: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(near.any(axis=1))]
 
 
-def _flexibility(resting: _Resting, weight: float) -> Estimate:
-    name = 'flexibility'
-    if math.isnan(weight):
-        return _nothing(name, 'the mass is to be found too, and only their ratio shows in shapes at rest')
+def _flexibility(resting: _Resting, weight: float) -> PriorEstimate:
+    """Return the estimate for a DLO of that weight per length [N/m]."""
     load, low, high = resting.load
-    parameter = BY_NAME[name]
+    parameter = BY_NAME['flexibility']
     lowest, highest = parameter.at_hundred, parameter.at_zero
-    words = []
     if resting.parts:
-        words.append(f'the balance of moments of {resting.parts} hanging part(s)')
         lowest = weight / (high * STIFFNESS_MARGIN)
         highest = weight / low * STIFFNESS_MARGIN if low > 0 else highest
     if resting.hold > 0:
         held = BY_NAME['friction'].at_hundred * weight / resting.hold * FRICTION_MARGIN
-        if lowest < held < highest:
-            highest = held
-            words.append('the bend that friction on the table can hold')
-    if not words:
-        return _nothing(name, 'nothing hangs, and nothing lies bent on the table')
-    return _scaled(name, weight / load if load > 0 else math.nan, lowest, highest,
-                   f'{" and ".join(words)}: EI from {measured(lowest, parameter.unit)}'
-                   f' to {measured(highest, parameter.unit)}')
+        highest = held if lowest < held < highest else highest
+    return _scaled('flexibility', weight / load if load > 0 else math.nan, lowest, highest)
 
 
-def _elasticity(resting: _Resting, weight: float) -> Estimate:
-    name = 'elasticity'
-    if math.isnan(weight):
-        return _nothing(name, 'the mass is to be found too, and only their ratio shows in shapes at rest')
+def _elasticity(resting: _Resting, weight: float) -> PriorEstimate:
+    """Return the estimate for a DLO of that weight per length [N/m]."""
     stretch, low, high = resting.stretch
     if not math.isfinite(high):
-        return _nothing(name, 'nothing hangs, and a pull along the table is not known')
-    lowest = weight / (high * STIFFNESS_MARGIN)
-    highest = weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME[name].at_zero
-    seen = low > 0
-    return _scaled(name, weight / stretch if seen else math.nan, lowest, highest,
-                   f'{"the stretch" if seen else "no measurable stretch"} of {resting.parts} hanging part(s) '
-                   f'under their weight: EA from {measured(lowest, BY_NAME[name].unit)}')
+        return UNKNOWN
+    highest = weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME['elasticity'].at_zero
+    return _scaled('elasticity', weight / stretch if low > 0 else math.nan,
+                   weight / (high * STIFFNESS_MARGIN), highest)
 
 
-def _friction(resting: _Resting) -> Estimate:
-    name = 'friction'
-    if resting.hold == 0:
-        return _nothing(name, 'nothing lies bent on the table')
+def _friction(resting: _Resting) -> PriorEstimate:
     load, _, highest_load = resting.load
-    if not load > 0:
-        return _nothing(name, 'it holds the DLO bent on the table, but the stiffness is not known')
-    lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
-    most = BY_NAME[name].at_hundred
+    if resting.hold == 0 or not load > 0:
+        return UNKNOWN
+    most = BY_NAME['friction'].at_hundred
     halfway = math.sqrt(min(most, resting.hold / load) * most)  # on the scale, from the least that holds it
-    return _scaled(name, halfway, lowest, most,
-                   f'the bend that the DLO keeps on the table: at least {measured(lowest, "1")}')
+    lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
+    return _scaled('friction', halfway, lowest, most)
 
 
-def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: float) -> Estimate:
-    name = 'self_collision'
-    parameter = BY_NAME[name]
+def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: float) -> PriorEstimate:
+    parameter = BY_NAME['self_collision']
     radii = np.geomspace(parameter.at_zero, parameter.at_hundred, RADII)
     allowed = np.ones(RADII, bool)
     for trial in trials:
@@ -296,10 +261,5 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
     levels = [] if table_height is None else [
         level - table_height for trial in trials for level in [resting_level(trial, table_height)]
         if level is not None and parameter.at_zero <= level - table_height <= parameter.at_hundred]
-    words = [f'no parts that are not neighbours were nearer than {2 * largest:.3g} m'] * (
-        largest < parameter.at_hundred)
-    words += ['the height of its middle above the table'] * bool(levels)
-    if not words:
-        return _nothing(name, 'nothing came near itself, and nothing lies on the table')
-    return _scaled(name, float(np.median(levels)) if levels else math.nan, parameter.at_zero, largest,
-                   '; '.join(words))
+    return _scaled('self_collision', float(np.median(levels)) if levels else math.nan, parameter.at_zero,
+                   largest)

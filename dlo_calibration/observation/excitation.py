@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Mapping, NamedTuple, Sequence
+from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.estimate import estimate
 from dlo_calibration.observation.noise import noise
 
 CLEAR = 0.1  # m above the table, and the length of the hands' paths: surely not touched
@@ -26,43 +24,13 @@ PULL = 4.0  # weights of the DLO that one hand, which drags and swings it, pulls
 UNSEEN = 0.2  # of the noise: a smaller change is not seen
 
 
-@dataclass(frozen=True)
-class Excitation:
+def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None
+            ) -> NDArray[np.bool_]:
     """
-    Which free parameters the trials can tell anything about.
+    Return which free parameters each trial can show, (T, d): False only where it surely cannot.
 
-    :param table: (T, d), False only where a trial surely does not show a parameter.
-    :param reasons: in words, for every parameter that some trial does not show.
+    :param table_height: [m]; None where there is no table.
     """
-
-    table: NDArray[np.bool_]
-    reasons: Mapping[str, str]
-
-
-class Priors(NamedTuple):
-    """
-    What the chains alone say, as a search takes it.
-
-    `start` (nan where there is none), `lower` and `upper` are (d,) in the unit
-    cube, `rows` (T,) numbers of residuals, `excites` (T, d).
-    """
-
-    start: Floats
-    lower: Floats
-    upper: Floats
-    rows: NDArray[np.intp]
-    excites: NDArray[np.bool_]
-
-
-def priors(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Priors:
-    """Return what the chains alone say; `table_height` [m] is None where there is no table."""
-    start, lower, upper = estimate(trials, space, table_height).cube()
-    rows = frozen_array([3 * len(trial.goals) * len(trial.initial) for trial in trials], int)
-    return Priors(start, lower, upper, rows, excites(trials, space, table_height).table)
-
-
-def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Excitation:
-    """Return which free parameters each trial can show; `table_height` [m]: None without a table."""
     sigma = noise(trials)
     rows = []
     for trial in trials:
@@ -74,20 +42,7 @@ def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float 
             'internal_damping': any(not goal.stable for goal in trial.goals),
             'mass': not all(p.per_weight <= (p.name in space.free) for p in BY_NAME.values())}
         rows.append([shown.get(name, True) for name in space.free])
-    table = frozen_array(np.reshape(rows, (len(trials), space.dimension)), bool)
-    reasons = {name: REASONS[name] for name, column in zip(space.free, table.T, strict=True)
-               if not column.all()}
-    return Excitation(table, reasons)
-
-
-REASONS = {
-    'friction': 'the DLO touches neither a table nor itself',
-    'self_collision': 'parts of the DLO that are no neighbours stay apart',
-    'elasticity': 'nothing pulls hard enough for a stretch that shows in the noise',
-    'damping': 'it was observed at rest only',
-    'internal_damping': 'it was observed at rest only',
-    'mass': 'shapes show only its ratio to the stiffnesses, which are to be found too',
-}
+    return frozen_array(np.reshape(rows, (len(trials), space.dimension)), bool)
 
 
 def _chains(trial: Trial) -> list[Floats]:

@@ -11,7 +11,7 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.observation.excitation import excites, priors
+from dlo_calibration.observation.excitation import excites
 
 ALL = ParameterSpace(free=tuple(BY_NAME))
 
@@ -23,7 +23,7 @@ def straight(height, count=21, shift=0.0):
 
 
 def shown(trial, name, table_height=0.0, space=ALL):
-    return bool(excites([trial], space, table_height).table[0, space.free.index(name)])
+    return bool(excites([trial], space, table_height)[0, space.free.index(name)])
 
 
 def test_friction_needs_something_to_touch():
@@ -73,23 +73,3 @@ def test_mass_shows_only_beside_a_known_stiffness():
     trial = trial_of(points, None, points)
     assert not shown(trial, 'mass')
     assert shown(trial, 'mass', space=ParameterSpace(free=('mass', 'friction')))
-
-
-def test_reasons_name_what_some_trial_does_not_show():
-    points = straight(0.005)
-    found = excites([trial_of(points, None, points)], ALL, 0.0)
-    assert set(found.reasons) == {'self_collision', 'damping', 'internal_damping', 'mass'}
-    assert 'at rest' in found.reasons['damping']
-
-
-@pytest.mark.parametrize('count', [3, 4, 21])
-def test_priors_have_the_shapes_a_search_takes(count):
-    points = straight(0.005, count)
-    found = priors([trial_of(points, None, points)] * 2, ALL, 0.0)
-    assert found.rows.tolist() == [3 * count] * 2
-    assert found.excites.shape == (2, ALL.dimension)
-    for one in found[:3]:
-        assert one.shape == (ALL.dimension,)
-    known = ~np.isnan(found.start)
-    assert ((found.lower <= found.start) & (found.start <= found.upper))[known].all()
-    assert ((found.lower >= 0) & (found.upper <= 1)).all()
