@@ -89,56 +89,61 @@ class Options:
     """
     Everything that a user can set; see the declarations for meaning, unit and range.
 
-    `values` holds, for every parameter of the table but the mass, its value on
-    the 0..100 scale where it is not calibrated; each is an option of its own.
+    `values` holds the fixed value of every parameter except the mass, on the 0..100
+    scale. It is used if the parameter is not calibrated. Each is an option of its own.
     """
 
     mass: float = _option(
-        0.0, 'mass of the whole DLO; 0: not known, an assumed density is used and stiffnesses '
-        'are reported per weight', unit='kg', minimum=0.0, maximum=1000.0)
-    table: bool = _option(True, 'there is a table')
-    table_height: float = _option(0.0, 'height of the table', unit='m', minimum=-100.0, maximum=100.0)
+        0.0, 'mass of the whole DLO; 0: unknown, so a density is assumed and stiffness is reported '
+        'relative to weight', unit='kg', minimum=0.0, maximum=1000.0)
+    table: bool = _option(True, 'whether there is a table')
+    table_height: float = _option(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0)
     scene: str = _option(
-        '', 'path of a URDF file with fixed obstacles that the DLO touches, beside the table; relative to '
-        'the working directory; empty: none')
+        '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
+        'relative to the working directory; empty: no obstacles')
     calibrate: tuple[str, ...] = _option(
-        PAPER_PARAMETERS, 'names of the parameters to find; the others keep their value',
+        PAPER_PARAMETERS, 'names of the parameters to find; all others keep their fixed value',
         choices=tuple(BY_NAME))
     parts: int = _option(
-        1, 'equal parts of the length that have a bending stiffness of their own; more than 1: where '
-        'flexibility is calibrated, so are stiffness_2 and so on; as many at least as calibrate names; '
-        '0: as many as predict trials that are left out better', minimum=0, maximum=MOST_PARTS)
-    search: str = _option('least_squares', 'search method', choices=tuple(SEARCHES))
-    evaluations: int = _option(PAPER_EVALUATIONS, "parameter sets to try at most (the paper's rounds)",
-                               minimum=1, maximum=1000000)
+        1, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
+        'cross-validation; if flexibility is calibrated, so is the stiffness of every part; a higher '
+        'part that calibrate names raises the number', minimum=0, maximum=MOST_PARTS)
+    search: str = _option('least_squares', 'method that chooses the parameter sets to try',
+                          choices=tuple(SEARCHES))
+    evaluations: int = _option(
+        PAPER_EVALUATIONS, "largest number of parameter sets to try (the paper's rounds)", minimum=1,
+        maximum=1000000)
     seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
-    engine: str = _option(AUTO, 'simulation engine; auto: compiled where it can be, and what it finds is '
-                          'simulated by bullet once more; else bullet', choices=ENGINES)
-    workers: int = _option(0, 'number of processes that simulate; 0: one per core', minimum=0, maximum=1024)
+    engine: str = _option(AUTO, 'simulation engine; auto: search with compiled and confirm the result with '
+                          'bullet, or use bullet alone if there is a scene', choices=ENGINES)
+    workers: int = _option(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024)
     scheduler: str = _option(
-        '', 'address of a Dask scheduler whose workers simulate, on any number of machines, e.g. '
-        'tcp://host:8786; workers has no effect then; empty: this machine alone')
-    nodes: int = _option(DEFAULT_NODES, 'point masses of the simulated DLO', minimum=8, maximum=1000)
+        '', 'address of a Dask scheduler, e.g. tcp://host:8786; its workers then simulate, on any number of '
+        'machines, and the option workers has no effect; empty: simulate on this machine')
+    nodes: int = _option(DEFAULT_NODES, 'number of point masses of the simulated DLO', minimum=8,
+                         maximum=1000)
     time_step: float = _option(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,
                                maximum=0.02)
     stable_distance: float = _option(
-        0.0005, 'a DLO is stable when all its points moved less than this within stable_time',
+        0.0005, 'the DLO is stable when all its nodes moved less than this within stable_time',
         unit='m', minimum=1e-6, maximum=0.1)
-    stable_time: float = _option(0.25, 'see stable_distance', unit='s', minimum=0.01, maximum=60.0)
-    settle_limit: float = _option(10.0, 'give up waiting for a stable DLO after that long (simulated)',
+    stable_time: float = _option(0.25, 'time over which stable_distance is measured', unit='s',
+                                 minimum=0.01, maximum=60.0)
+    settle_limit: float = _option(10.0, 'simulated time after which waiting for a stable DLO ends',
                                   unit='s', minimum=0.1, maximum=600.0)
     grip_tolerance: float = _option(
-        0.02, 'an action without annotated grip is refused where no point is that near to the hand',
+        0.02, 'an action without annotated grip is refused if no point is this near to the hand',
         unit='m', minimum=0.0, maximum=10.0)
     length_tolerance: float = _option(
-        50.0, 'a goal chain is refused where its length differs more from the initial one',
+        50.0, 'a goal chain is refused if its length differs by more than this from the initial chain',
         unit='%', minimum=0.0, maximum=1000.0)
     release: bool = _option(
-        True, 'a hand opens at its last waypoint, where goal chains have no hand field that tells')
-    start_after_trials: int = _option(0, 'calibrate by itself after that many trials; 0: wait for ~/start',
-                                      minimum=0, maximum=1000000)
-    output_directory: str = _option('.', 'folder that the session and the result are written to')
-    record: bool = _option(True, 'record the session')
+        True, 'whether a hand opens at its last waypoint; used if goal chains have no hand field')
+    start_after_trials: int = _option(
+        0, 'number of trials after which calibration starts by itself; 0: wait for ~/start', minimum=0,
+        maximum=1000000)
+    output_directory: str = _option('.', 'folder for the session and the result')
+    record: bool = _option(True, 'whether to record the session')
     values: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -186,7 +191,7 @@ def _unknown(name: str) -> Any:
 
 FIXED_VALUES: Mapping[str, Declaration] = {
     p.name: Declaration(
-        p.name, p.default, f'{p.description}: {p.quantity}, where it is not calibrated '
+        p.name, p.default, f'{p.description}: {p.quantity}, if it is not calibrated '
         f'(0: {measured(p.at_zero, p.unit)}, 100: {measured(p.at_hundred, p.unit)}, '
         f'{"linear" if p.linear else "logarithmic"})',
         minimum=0.0, maximum=SCALE)

@@ -36,10 +36,10 @@ class Parameter:
     :param at_hundred: physical value at 100.
     :param default: value on the 0..100 scale where it is not calibrated.
     :param linear: True where the scale is linear, else it is logarithmic.
-    :param neutral: physical value at exactly the default, whatever the scale rounds it to,
-        where the default means that the DLO is without what the parameter describes.
-    :param per_weight: True where only its ratio to the DLO's weight shows in
-        motion that gravity drives, so that without a known mass the ratio is reported.
+    :param neutral: exact physical value at the default, for a parameter that has no effect
+        there (1 for a ratio; 0, which a logarithmic scale does not have).
+    :param per_weight: True if motion under gravity depends only on the ratio of this
+        parameter to the DLO's weight; without a known mass, that ratio is reported.
     """
 
     name: str
@@ -85,25 +85,25 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('elasticity', 'stretching stiffness EA', 'N', 1e4, 1e0, 25.0,
               'how easily the DLO stretches', per_weight=True),
     Parameter('friction', 'Coulomb friction coefficient', '1', 10**-2.0, 10**0.3, 70.0,
-              'friction of the DLO on the table and on itself'),
+              'friction of the DLO with the table and with itself'),
     Parameter('self_collision', 'self-collision radius', 'm', 2e-3, 3e-2, 25.0,
-              'radius at which parts of the DLO touch each other'),
+              'radius of the DLO where it touches itself'),
     Parameter('damping', 'drag per mass', '1/s', 1e-2, 1e2, 50.0,
-              'how fast motion through the air dies out'),
+              'how fast drag in the air slows the DLO'),
     Parameter('internal_damping', 'stiffness-proportional damping', 's', 1e-3, 1e-1, 0.0,
-              'how fast bending and stretching vibrations die out (0.6 time steps at least)'),
+              'how fast bending and stretching vibrations fade (no effect below 0.6 time steps)'),
     Parameter('mass', 'mass of the whole DLO', 'kg', 1e-3, 1e1, 42.0, 'mass of the whole DLO'),
-    Parameter('length_scale', 'length at rest by the observed length', '1', 0.9, 1 / 0.9, 50.0,
-              'how long the DLO is, where the observed length is not exact', neutral=1.0),
-    Parameter('natural_curvature', 'curvature at rest', '1/m', 0.0, 10.0, 0.0,
-              'how curved the DLO is where nothing bends it', linear=True, neutral=0.0),
-    Parameter('marker_mass', 'mass at each point annotated as feature', 'kg', 1e-6, 1e-1, 0.0,
-              'how heavy a marker or plug is, beside the DLO (0: nothing)', per_weight=True,
+    Parameter('length_scale', 'rest length relative to the observed length', '1', 0.9, 1 / 0.9, 50.0,
+              'correction of the observed length', neutral=1.0),
+    Parameter('natural_curvature', 'curvature of the rest shape', '1/m', 0.0, 10.0, 0.0,
+              'how curved the DLO is when nothing bends it', linear=True, neutral=0.0),
+    Parameter('marker_mass', 'mass at each point annotated as a feature', 'kg', 1e-6, 1e-1, 0.0,
+              'how heavy each marker or plug on the DLO is (0: no mass)', per_weight=True,
               neutral=0.0),
-    Parameter('torsion', 'twisting stiffness GJ by bending stiffness EI', '1', 1e-2, 1e1, 0.0,
+    Parameter('torsion', 'ratio of twisting stiffness GJ to bending stiffness EI', '1', 1e-2, 1e1, 0.0,
               'how much the DLO resists twist between two clamps (0: not at all)', neutral=0.0),
-    *(Parameter(part_name(part), f'bending stiffness of part {part} by that of part 1', '1', 0.02, 50.0, 50.0,
-                f'how stiff part {part} of the DLO is, of as many equal parts as there are', neutral=1.0)
+    *(Parameter(part_name(part), f'bending stiffness of part {part} relative to part 1', '1', 0.02, 50.0,
+                50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}

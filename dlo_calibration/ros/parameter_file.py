@@ -4,7 +4,7 @@
 """
 Parameter file: ``config/calibrator.yaml``, every parameter of the node with a comment.
 
-After a change of the declarations, make it again with
+The file is generated from the declarations of the options. After a change of those, make it again with
 
     python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
@@ -18,15 +18,17 @@ import textwrap
 from dlo_calibration.calibration.options import Declaration, declarations
 
 HEAD = """\
-Parameters of the node calibrator, with their defaults.  To change some, copy this file, change their
-values there (lines that you leave out keep the default), and give the copy to the node:
+All parameters of the node calibrator, with their defaults.  To change some, copy this file, edit the copy
+(a parameter that you leave out keeps its default), and start the node with it:
 
     ros2 run dlo_calibration calibrator --ros-args --params-file my_calibrator.yaml
     ros2 launch dlo_calibration calibrator.launch.py params_file:=my_calibrator.yaml
 
-An unknown name or a value out of range is refused when the node starts.
+The node does not start with an unknown name or a value out of range.
 
-This file is made from the declarations: python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
+This file is generated:
+
+    python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
 WIDTH = 100  # columns
 INDENT = '    '
