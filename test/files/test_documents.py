@@ -73,7 +73,8 @@ def test_the_rope_of_the_readme_runs(tmp_path):
     result = fitted(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
     simulator.close()
     write_result(tmp_path / 'result.xml', result)
-    snippet = (ROOT / 'README.md').read_text(encoding='utf-8').split('```python\n')[1].split('```')[0]
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    snippet, = (one for one in re.findall('```python\n(.*?)```', text, re.DOTALL) if 'rope.step()' in one)
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
     names = {'read_result': read_result, 'BulletRope': BulletRope, 'Chain': Chain, 'client': client,
