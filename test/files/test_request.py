@@ -343,7 +343,7 @@ def test_request_that_cannot_be_used_takes_one_line(command, file):
 
 
 def test_examples_of_the_document_are_what_it_says():
-    text = (SAMPLES.parents[2] / 'doc' / 'formats.md').read_text(encoding='utf-8')
+    text = (SAMPLES.parents[1] / 'doc' / 'formats.md').read_text(encoding='utf-8')
     described, asked = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
     found = request_of(asked.encode())
