@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Robot software that has a DLO calibrated: one trial, the start, the result.
+A robot program that has a DLO calibrated: it sends one trial, starts the calibration, and logs the result.
 
     ros2 run dlo_calibration calibrator --ros-args -p mass:=0.03
     python3 examples/robot_session.py
 
-Put your camera into `observed`, and your robot's motion into `move`.
+Replace `observed` by your camera, and `move` by the motion of your robot.
 """
 
 import time
@@ -27,20 +27,20 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def observed(moved):
-    """Return the points along the DLO, (n, 3) [m]; here made up: on a table, one end moved or not."""
+    """Return the points along the DLO, (n, 3) [m]; invented here: on a table, one end moved or not."""
     along = np.linspace(0, 0.6, 13)
     aside = 0.1 * np.exp(-along / 0.2) if moved else 0 * along
     return np.stack([along, aside, 0 * along + 0.004], axis=1)
 
 
 def move(gripper):
-    """Return times [s] and positions [m] of the gripper: closed at the first, opened at the last."""
+    """Return times [s] and positions [m] of the gripper, which closes at the first and opens at the last."""
     return zip((0.0, 0.3, 0.7, 1.0), gripper + np.array(
         [(0, 0, 0), (0, 0, 0.05), (0, 0.1, 0.05), (0, 0.1, 0)]), strict=True)
 
 
 def chain(points, stamp):
-    """Return the cloud of a chain; initial and goal have the same points of the material, in one order."""
+    """Return the cloud of a chain; initial and goal chain have the same material points in the same order."""
     cloud = PointCloud2(height=1, width=len(points), point_step=12, row_step=12 * len(points), is_dense=True)
     cloud.header.frame_id, cloud.header.stamp = FRAME, stamp.to_msg()
     cloud.fields = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
@@ -50,7 +50,7 @@ def chain(points, stamp):
 
 
 def action(waypoints, stamp):
-    """Return what one hand did; it grips the point of the chain that is nearest to its first waypoint."""
+    """Return the action of one hand, which grips the point of the chain nearest to its first waypoint."""
     message = MultiDOFJointTrajectory(joint_names=['left_hand'])
     message.header.frame_id, message.header.stamp = FRAME, stamp.to_msg()
     for seconds, (x, y, z) in waypoints:
@@ -95,7 +95,7 @@ def main():
     time.sleep(1.5)  # the robot moves, and the DLO comes to rest
     goal.publish(chain(observed(moved=True), node.get_clock().now()))
     wait(lambda: (status('trials'), status('last_refusal')) != before)
-    heard.clear()  # of what an earlier calibration left
+    heard.clear()  # an earlier calibration may have left a result
     answer = start.call_async(Trigger.Request())
     wait(answer.done)
     log.info(answer.result().message)
