@@ -191,9 +191,9 @@ def _unknown(name: str) -> Any:
 
 FIXED_VALUES: Mapping[str, Declaration] = {
     p.name: Declaration(
-        p.name, p.default, f'{p.description}: {p.quantity}, if it is not calibrated '
-        f'(0: {measured(p.at_zero, p.unit)}, 100: {measured(p.at_hundred, p.unit)}, '
-        f'{"linear" if p.linear else "logarithmic"})',
+        p.name, p.default, f'{p.description}: {p.quantity} from {measured(p.at_zero, p.unit)} (at 0) to '
+        f'{measured(p.at_hundred, p.unit)} (at 100), {"linear" if p.linear else "logarithmic"}; '
+        'used if it is not calibrated',
         minimum=0.0, maximum=SCALE)
     for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg of its own
 

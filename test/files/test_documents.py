@@ -3,10 +3,10 @@
 
 """The documents say what is declared."""
 
+from dataclasses import replace
 from pathlib import Path
 import re
 
-from fitting import fitted
 import pytest
 
 from dlo_calibration.calibration.options import declarations
@@ -56,32 +56,34 @@ def test_links_lead_somewhere(document):
             assert ((ROOT / document).parent / target).exists(), target
 
 
-def test_the_rope_of_the_readme_runs(tmp_path):
-    """Execute the three lines of README on a result that was fitted and written."""
+def test_the_snippets_of_the_readme_work(tmp_path, capsys):
+    """Execute them one after the other, on a sample and with fewer evaluations."""
     import pybullet
 
-    from dlo_calibration.files.result import read_result, write_result
-    from dlo_calibration.files.session import read_session
-    from dlo_calibration.model.chain import Chain
-    from dlo_calibration.model.parameters import ParameterSpace
-    from dlo_calibration.search import LeastSquares
-    from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
+    from dlo_calibration.files.result import write_result
 
-    session = read_session(ROOT / 'msg_samples/object1')
-    trials = session.trials
-    simulator = BulletSimulator()
-    result = fitted(trials[:1], ParameterSpace(mass=0.03), simulator, LeastSquares(4, seed=1), budget=1)
-    simulator.close()
-    write_result(tmp_path / 'result.xml', result)
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
-    snippet, = (one for one in re.findall('```python\n(.*?)```', text, re.DOTALL) if 'rope.step()' in one)
+    sample, few = str(ROOT / 'msg_samples/object1'), "evaluations=2, nodes=12, workers=1, engine='compiled'"
+    for written, tried in (('dlo_session_20260101_120000', sample), ('another_session', sample),
+                           ('mass=0.03', f'mass=0.03, {few}'),
+                           ('session.options)', f'replace(session.options, {few}))'),
+                           ('fitted/result.xml', str(tmp_path / 'result.xml'))):
+        assert written in text
+        text = text.replace(written, tried)
+    one, several, world = re.findall('```python\n(.*?)```', text, re.DOTALL)
+    names = {'replace': replace}
+    exec(one, names)
+    assert capsys.readouterr().out.count('flexibility') == 1
+    exec(several, names)
+    assert len(names['result'].trials) == 2 * len(names['session'].trials)
+    write_result(tmp_path / 'result.xml', names['result'])
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-    names = {'read_result': read_result, 'BulletRope': BulletRope, 'Chain': Chain, 'client': client,
-             'points': trials[0].initial.points + (0, 0, 1)}
-    exec(snippet.replace('fitted/result.xml', str(tmp_path / 'result.xml')), names)
-    rope = names['rope']
-    # There is no table in this world: one step of free fall.
-    expected = 9.81 * rope.time_step**2
+    points = names['session'].trials[0].initial.points + (0, 0, 1)
+    names.update(client=client, points=points)
+    exec(world, names)
     pybullet.disconnect(physicsClientId=client)
-    assert rope.points[:, 2].mean() == pytest.approx(names['points'][:, 2].mean() - expected, abs=3e-4)
+    # There is no table in this world: one step of free fall.
+    rope = names['rope']
+    expected = points[:, 2].mean() - 9.81 * rope.time_step**2
+    assert rope.points[:, 2].mean() == pytest.approx(expected, abs=3e-4)
