@@ -152,7 +152,7 @@ def test_any_request_comes_back_exactly(initial, goal, several, name, of_object,
 def test_options_come_back_as_the_calibrator_takes_them():
     found = returned(request(options=OPTIONS))
     assert dict(found.options) == OPTIONS
-    assert found.options == Options.of(OPTIONS)
+    assert Options.of(found.options) == Options.of(OPTIONS)
 
 
 def test_all_options_come_back():
@@ -362,7 +362,7 @@ def test_samples_use_every_named_action_and_both_ways():
 def test_sample_is_written_as_this_package_writes(file):
     found = read_request(file)
     assert found.document == file.read_bytes()
-    trials, refusals = request_trials(found, found.options)
+    trials, refusals = request_trials(found, Options.of(found.options))
     assert len(trials) == len(found.trials) and refusals == ()
 
 
