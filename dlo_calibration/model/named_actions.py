@@ -5,14 +5,16 @@
 Named actions: what to do with a DLO, in words; each becomes what the hands do.
 
 On the wire an action is always what the hands did.  A named action is the short
-way to say it: given the chain before it, `action` returns the paths of the
-hands.  A hand closes where the chain is, moves at constant speed, and `hold`
-says whether it holds the DLO afterwards.  Where it does, goal chains are to say so.
+way to say it: given the chain before it, `action` returns the paths of the hands.
+A hand closes where the chain is and moves at constant speed.  `hold` says whether
+it still holds the DLO afterwards.
 
-Positions are those of the hand [m], which is the gripped point.  The point is
-either an index of the chain (negative: from its end) or a fraction of the length,
-of which the nearest point of the chain is taken.  A target is either coordinates,
-or a direction (of any length) and a distance.
+The position of a hand [m] is that of the point that it grips.  That point is given
+as an index of the chain (negative: from its end), or as a fraction of the length,
+which means the point of the chain nearest to it.  A target is given as coordinates,
+or as a direction (of any length) and a distance.
+
+Each action says what it shows of each of the paper's four parameters, and what it does not.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ from dataclasses import dataclass, fields
 from typing import ClassVar, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
@@ -30,17 +31,17 @@ from dlo_calibration.model.chain import Chain, Floats
 Numbers = tuple[float, ...]
 
 UP = np.array([0.0, 0.0, 1.0])
+LEAST, MOST = 1e-9, 1e6  # m, m/s, s: limits of distances, speeds and times, far beyond what a robot does
+NO_TIME = 1e-9  # s: a shorter move is left out, as the times of its waypoints could be the same float
 APART, TOGETHER = 'apart', 'together'
-MOVING = ('both', 'first', 'second')
-NO_TIME = 1e-9  # s: what is nearer is not gone to, for after MOST seconds a float cannot tell less
-LEAST, MOST = 1e-9, 1e6  # of what follows, and of a start: beyond, it is no hand of a robot
-POSITIVE = ('speed', 'height', 'distance')
+#: Which of two hands moves -> the share of the distance that each of them moves by.
+MOVING = {'both': (0.5, 0.5), 'first': (1.0, 0.0), 'second': (0.0, 1.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class NamedAction:
     """
-    What all named actions have.
+    What all named actions share.
 
     :param start: when the hands close, seconds since the start of the trial.
     :param hold: the hands hold the DLO afterwards; else they open at the end of their path.
@@ -60,7 +61,7 @@ class NamedAction:
                 object.__setattr__(self, one.name, float(value))
         if not 0 <= self.start <= MOST:
             raise self._refused(f'start {self.start:g} s', f'0 to {MOST:g} s')
-        for name in POSITIVE:
+        for name in ('speed', 'height', 'distance'):
             value = getattr(self, name, None)
             if value is not None and not LEAST <= value <= MOST and not (
                     name == 'height' and value == 0 and self.may_be_flat):
@@ -74,7 +75,8 @@ class NamedAction:
     @property
     def hand_names(self) -> tuple[str, ...]:
         """Names of the hands that it uses."""
-        raise NotImplementedError
+        hands: tuple[str, ...] = vars(self)['hands'] if 'hands' in vars(self) else (vars(self)['hand'],)
+        return hands
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """
@@ -89,14 +91,23 @@ class NamedAction:
     def _refused(self, came: str, expected: str, remedy: str = 'correct the action') -> InputError:
         return InputError(f'action {self.name}', came, expected, remedy)
 
-    def _path(self, name: str, grip: int, points: Sequence[Floats], speed: float) -> Hand:
-        """Return a hand that goes through (3,) points [m] at a speed, leaving out those where it is."""
-        way = [points[0]]
-        for point in points[1:]:
-            if np.linalg.norm(point - way[-1]) > NO_TIME * speed:
-                way.append(point)
-        steps = np.linalg.norm(np.diff(way, axis=0), axis=1) / speed
-        return Hand(name, (grip,), self.start + np.concatenate([[0.0], np.cumsum(steps)]), np.array(way))
+    def _require_one(self, one: str, other: str, remedy: str) -> None:
+        """Refuse two fields that are both given, or both left out."""
+        values = getattr(self, one), getattr(self, other)
+        if (values[0] is None) == (values[1] is None):
+            raise self._refused(f'{one} {values[0]}, {other} {values[1]}', 'one of the two', remedy)
+
+    def _grip(self, chain: Chain, point: int | None, fraction: float | None) -> int:
+        """Return the index, from 0, of the point at an index, or nearest to a fraction of the length."""
+        if point is not None:
+            count = len(chain)
+            if not -count <= point < count:
+                raise self._refused(f'point {point}', f'{-count} to {count - 1}', 'name a point of the chain')
+            return int(point) % count
+        if fraction is None or not 0 <= fraction <= 1:
+            raise self._refused(f'fraction {fraction:g}', '0 to 1', 'give a fraction of the length')
+        along = chain.arc_lengths()
+        return int(np.abs(along - fraction * along[-1]).argmin())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,22 +127,22 @@ class _OneHand(NamedAction):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.point is None) == (self.fraction is None):
-            raise self._refused(f'point {self.point}, fraction {self.fraction}', 'one of the two',
-                                'say where the hand grips')
+        self._require_one('point', 'fraction', 'say where the hand grips')
 
-    @property
-    def hand_names(self) -> tuple[str, ...]:
-        """The one hand."""
-        return (self.hand,)
+    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
+        """Return the path of the hand at its speed, without the waypoints where it is already."""
+        grip = self._grip(chain, self.point, self.fraction)
+        way = [chain.points[grip]]
+        for point in self._way(way[0]):
+            if np.linalg.norm(point - way[-1]) > NO_TIME * self.speed:
+                way.append(point)
+        durations = np.linalg.norm(np.diff(way, axis=0), axis=1) / self.speed
+        times = self.start + np.concatenate([[0.0], np.cumsum(durations)])
+        return Action((Hand(self.hand, (grip,), times, np.array(way)),))
 
-    def _grip(self, chain: Chain) -> tuple[int, Floats]:
-        if self.point is not None:
-            grip = _by_index(self, chain, self.point)
-        else:
-            assert self.fraction is not None
-            grip = _by_fraction(self, chain, self.fraction)
-        return grip, chain.points[grip]
+    def _way(self, point: Floats) -> Sequence[Floats]:
+        """Return the waypoints, (3,) [m] each, after the gripped point."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,17 +166,19 @@ class _Carrying(_OneHand):
             raise self._refused(f'to {self.to}, direction {self.direction}, distance {self.distance}',
                                 'coordinates, or a direction and a distance', 'say where the hand goes')
         for name in ('to', 'direction'):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, _triple(self, name, getattr(self, name)))
+            if (value := getattr(self, name)) is not None:
+                numbers = np.asarray(value, dtype=float)
+                if numbers.shape != (3,) or not (np.abs(numbers) <= MOST).all():
+                    raise self._refused(f'{name} {value!r}', f'three numbers x y z of at most {MOST:g}')
+                object.__setattr__(self, name, tuple(numbers.tolist()))
         if self.direction is not None and not any(self.direction):
             raise self._refused('direction 0 0 0', 'a direction', 'say where the hand goes')
 
     def _target(self, point: Floats) -> Floats:
         if self.to is not None:
             return np.array(self.to)
-        assert self.direction is not None and self.distance is not None
         # The largest component first: the square of a tiny or a huge one would not be finite.
-        direction = np.array(self.direction) / np.abs(self.direction).max()
+        direction = np.array(self.direction) / np.abs(self.direction).max()  # type: ignore[arg-type]
         target: Floats = point + direction / np.linalg.norm(direction) * self.distance
         return target
 
@@ -175,33 +188,23 @@ class GraspAndPlace(_Carrying):
     """
     Lift a point, carry it through the air, put it down and open.
 
-    The hand goes up by `height` above the higher one of the two places, across,
-    and down to the target.
+    The hand goes up by `height` above the higher one of the two places, across, and down to the target.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Some, together with friction: the bends that stay near the placed point are those which
+    flexibility: some, together with friction: the bends that stay near the placed point are those which
         friction can hold against bending.
-    elasticity
-        Nothing: nothing pulls at the other end but friction.
-    friction
-        Some, together with flexibility: how much of the DLO follows.
-    self_collision
-        Nothing, unless the point is placed on or across the DLO (folding it); then much.
+    elasticity: nothing: nothing pulls at the other end but friction.
+    friction: some, together with flexibility: how much of the DLO follows.
+    self_collision: nothing, unless the point is placed on or across the DLO (folding it); then much.
 
     :param height: of the lift [m].
     """
 
     height: float = 0.05
 
-    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the path up, across and down."""
-        grip, point = self._grip(chain)
+    def _way(self, point: Floats) -> Sequence[Floats]:
         target = self._target(point)
         top = max(point[2], target[2]) + self.height
-        return Action((self._path(self.hand, grip, [point, _at_height(point, top), _at_height(target, top),
-                                                    target], self.speed),))
+        return [np.append(point[:2], top), np.append(target[:2], top), target]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,24 +212,16 @@ class Drag(_Carrying):
     """
     Pull a point straight to a target, along the table, and open.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Much, together with friction: how wide the bend beside the point is.  Dragging an end
-        along the DLO tells next to nothing.
-    elasticity
-        Nothing: friction alone is too weak to stretch a DLO visibly.
-    friction
-        Much, together with flexibility: how much of the DLO follows, and where it stops.  An end
-        dragged along the DLO tells some of friction alone.  Fast hands add inertia to it.
-    self_collision
-        Nothing, unless the DLO is dragged against itself.
+    flexibility: much, together with friction: how wide the bend beside the point is. Dragging an end along
+        the DLO tells next to nothing.
+    elasticity: nothing: friction alone is too weak to stretch a DLO visibly.
+    friction: much, together with flexibility: how much of the DLO follows, and where it stops. An end dragged
+        along the DLO tells some of friction alone. Fast hands add inertia to it.
+    self_collision: nothing, unless the DLO is dragged against itself.
     """
 
-    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the straight path."""
-        grip, point = self._grip(chain)
-        return Action((self._path(self.hand, grip, [point, self._target(point)], self.speed),))
+    def _way(self, point: Floats) -> Sequence[Floats]:
+        return [self._target(point)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,18 +229,12 @@ class LiftAndHold(_OneHand):
     """
     Lift a point straight up and hold it there.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Much, and little else, so that it is the action to begin with: how the free part bends
-        under its weight.  Without a known mass, only the ratio of both.  Where a limp DLO hangs
-        straight down, only that it is limp.
-    elasticity
-        Nothing, unless the DLO stretches visibly under its weight.
-    friction
-        Some: how far the part on the table was pulled in.  Nothing where all of it hangs.
-    self_collision
-        Nothing, unless two hanging parts touch.
+    flexibility: much, and little else, so that it is the action to begin with: how the free part bends under
+        its weight. Without a known mass, only the ratio of both. Where a limp DLO hangs straight down, only
+        that it is limp.
+    elasticity: nothing, unless the DLO stretches visibly under its weight.
+    friction: some: how far the part on the table was pulled in. Nothing where all of it hangs.
+    self_collision: nothing, unless two hanging parts touch.
 
     :param height: of the lift [m].
     """
@@ -253,10 +242,8 @@ class LiftAndHold(_OneHand):
     height: float = 0.1
     hold: bool = True
 
-    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the path up."""
-        grip, point = self._grip(chain)
-        return Action((self._path(self.hand, grip, [point, point + self.height * UP], self.speed),))
+    def _way(self, point: Floats) -> Sequence[Floats]:
+        return [point + self.height * UP]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,17 +254,11 @@ class PushDown(_OneHand):
     For a DLO that another hand holds up, or that bridges a gap.  A point that lies
     on the table cannot be pushed down.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Much: the shape between the pushed point and what holds the DLO up.
-    elasticity
-        Some, where both sides of the point are held and the DLO is pushed beyond
-        straight; nothing else.
-    friction
-        Some: how far the part on the table is pushed out or pulled in.
-    self_collision
-        Nothing, unless the point is pushed onto the DLO.
+    flexibility: much: the shape between the pushed point and what holds the DLO up.
+    elasticity: some, where both sides of the point are held and the DLO is pushed beyond straight; nothing
+        else.
+    friction: some: how far the part on the table is pushed out or pulled in.
+    self_collision: nothing, unless the point is pushed onto the DLO.
 
     :param distance: that the hand moves down [m].
     """
@@ -285,10 +266,8 @@ class PushDown(_OneHand):
     distance: float = 0.05
     hold: bool = True
 
-    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the path down."""
-        grip, point = self._grip(chain)
-        return Action((self._path(self.hand, grip, [point, point - self.distance * UP], self.speed),))
+    def _way(self, point: Floats) -> Sequence[Floats]:
+        return [point - self.distance * UP]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,19 +277,13 @@ class TwoHands(NamedAction):
 
     Hands move on the line through both points.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Together on the table: some, how it buckles.  In the air: little, as a DLO that hangs from
-        two points sags much the same whatever its stiffness, unless it is stiff.  Apart: the less,
-        the straighter it gets.
-    elasticity
-        Apart, beyond the straight DLO: the only action that shows it, if the distance between
-        the hands stretches the DLO by more than the error of observation.  Else nothing.
-    friction
-        On the table, together: some.  In the air, or apart: nothing.
-    self_collision
-        Together, until parts touch: some.  Else nothing.
+    flexibility: together on the table: some, how it buckles. In the air: little, as a DLO that hangs from two
+        points sags much the same whatever its stiffness, unless it is stiff. Apart: the less, the straighter
+        it gets.
+    elasticity: apart, beyond the straight DLO: the only action that shows it, if the distance between the
+        hands stretches the DLO by more than the error of observation. Else nothing.
+    friction: on the table, together: some. In the air, or apart: nothing.
+    self_collision: together, until parts touch: some. Else nothing.
 
     :param points: indices of the two gripped points; or
     :param fractions: of the length, 0 to 1, where the hands grip.
@@ -336,9 +309,7 @@ class TwoHands(NamedAction):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.points is None) == (self.fractions is None):
-            raise self._refused(f'points {self.points}, fractions {self.fractions}', 'one of the two',
-                                'say where the hands grip')
+        self._require_one('points', 'fractions', 'say where the hands grip')
         for name, values in (('points or fractions', self.points or self.fractions or ()),
                              ('hands', self.hands)):
             if len(values) != 2:
@@ -350,17 +321,10 @@ class TwoHands(NamedAction):
         if self.moving not in MOVING:
             raise self._refused(f'moving {self.moving!r}', f'one of {", ".join(MOVING)}')
 
-    @property
-    def hand_names(self) -> tuple[str, ...]:
-        """Both hands."""
-        return self.hands
-
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the paths of both hands, with waypoints at the same times."""
-        if self.points is not None:
-            grips = [_by_index(self, chain, one) for one in self.points]
-        else:
-            grips = [_by_fraction(self, chain, one) for one in self.fractions or ()]
+        grips = [self._grip(chain, point, fraction) for point, fraction in zip(
+            self.points or (None, None), self.fractions or (None, None), strict=True)]
         if grips[0] == grips[1]:
             raise self._refused(f'both hands at point {grips[0]}', 'two different points',
                                 'grip further apart')
@@ -372,7 +336,7 @@ class TwoHands(NamedAction):
                                 'less than their distance', 'choose a smaller distance')
         if gap == 0:
             raise self._refused('two points at the same place', 'two places', 'grip elsewhere')
-        shares = {'both': (0.5, 0.5), 'first': (1.0, 0.0), 'second': (0.0, 1.0)}[self.moving]
+        shares = MOVING[self.moving]
         step = between / gap * (self.distance if self.motion == TOGETHER else -self.distance)
         up = begin + self.height * UP
         end = up + np.array([shares[0] * step, -shares[1] * step])
@@ -390,18 +354,12 @@ class Release(NamedAction):
     """
     Open hands that an earlier action left holding, where they are.
 
-    What it can tell, and what it cannot:
-
-    flexibility
-        Much, after a lift: the bends that remain when it has fallen.  The motion itself tells
+    flexibility: much, after a lift: the bends that remain when it has fallen. The motion itself tells
         damping, if timed goals show it.
-    elasticity
-        Nothing, unless it was stretched before and timed goals show how it springs back.
-    friction
-        Some: which bends the table keeps.  What was bent with the hands on the table, and
-        springs back, tells the most.
-    self_collision
-        Some where it falls onto itself; nothing else.
+    elasticity: nothing, unless it was stretched before and timed goals show how it springs back.
+    friction: some: which bends the table keeps. What was bent with the hands on the table, and springs back,
+        tells the most.
+    self_collision: some where it falls onto itself; nothing else.
 
     :param hands: names of the hands that open.
     """
@@ -412,11 +370,6 @@ class Release(NamedAction):
         super().__post_init__()
         if self.hold:
             raise self._refused('hold', 'hands that open', 'leave hold out')
-
-    @property
-    def hand_names(self) -> tuple[str, ...]:
-        """The hands that open."""
-        return self.hands
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return one waypoint for each hand: where it came to rest, holding the same points."""
@@ -444,28 +397,3 @@ NAMED_ACTIONS: Mapping[str, type[NamedAction]] = {
     'two_hands': TwoHands,
     'release': Release,
 }
-
-
-def _by_index(action: NamedAction, chain: Chain, index: int) -> int:
-    count = len(chain)
-    if not -count <= index < count:
-        raise action._refused(f'point {index}', f'{-count} to {count - 1}', 'name a point of the chain')
-    return int(index) % count
-
-
-def _by_fraction(action: NamedAction, chain: Chain, fraction: float) -> int:
-    if not 0 <= fraction <= 1:
-        raise action._refused(f'fraction {fraction:g}', '0 to 1', 'give a fraction of the length')
-    along = chain.arc_lengths()
-    return int(np.abs(along - fraction * along[-1]).argmin())
-
-
-def _triple(action: NamedAction, name: str, values: ArrayLike) -> Numbers:
-    numbers = np.asarray(values, dtype=float)
-    if numbers.shape != (3,) or not (np.abs(numbers) <= MOST).all():
-        raise action._refused(f'{name} {values!r}', f'three numbers x y z of at most {MOST:g}')
-    return tuple(float(one) for one in numbers)
-
-
-def _at_height(point: Floats, z: float) -> Floats:
-    return np.array([point[0], point[1], z])
