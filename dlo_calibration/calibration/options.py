@@ -31,6 +31,9 @@ AUTO = 'auto'  # engine: the fastest one that can do it, and another one that co
 CONFIRMING = 'bullet'
 ENGINES = (AUTO, CONFIRMING, 'compiled')
 
+#: What an option belongs to: how trials were observed, what is searched and how it is simulated, the machine.
+OBSERVATION, SEARCH, MACHINE = 'observation', 'search', 'machine'
+
 
 @dataclass(frozen=True)
 class Declaration:
@@ -40,6 +43,7 @@ class Declaration:
     :param default: its type is the option's type (bool, int, float, str, or a
         tuple of str).
     :param choices: the values that a str, or each of a tuple of str, may have.
+    :param of: OBSERVATION, SEARCH, or MACHINE, which has no effect on what is found.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Declaration:
     minimum: float | None = None
     maximum: float | None = None
     choices: tuple[str, ...] = ()
+    of: str = SEARCH
 
     def checked(self, value: Any) -> Any:
         """
@@ -96,11 +101,12 @@ class Options:
     mass: float = _option(
         0.0, 'mass of the whole DLO; 0: unknown, so a density is assumed and stiffness is reported '
         'relative to weight', unit='kg', minimum=0.0, maximum=1000.0)
-    table: bool = _option(True, 'whether there is a table')
-    table_height: float = _option(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0)
+    table: bool = _option(True, 'whether there is a table', of=OBSERVATION)
+    table_height: float = _option(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0,
+                                  of=OBSERVATION)
     scene: str = _option(
         '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
-        'relative to the working directory; empty: no obstacles')
+        'relative to the working directory; empty: no obstacles', of=OBSERVATION)
     calibrate: tuple[str, ...] = _option(
         PAPER_PARAMETERS, 'names of the parameters to find; all others keep their fixed value',
         choices=tuple(BY_NAME))
@@ -116,10 +122,11 @@ class Options:
     seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
     engine: str = _option(AUTO, 'simulation engine; auto: search with compiled and confirm the result with '
                           'bullet, or use bullet alone if there is a scene', choices=ENGINES)
-    workers: int = _option(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024)
+    workers: int = _option(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
+                           of=MACHINE)
     scheduler: str = _option(
         '', 'address of a Dask scheduler, e.g. tcp://host:8786; its workers then simulate, on any number of '
-        'machines, and the option workers has no effect; empty: simulate on this machine')
+        'machines, and the option workers has no effect; empty: simulate on this machine', of=MACHINE)
     nodes: int = _option(DEFAULT_NODES, 'number of point masses of the simulated DLO', minimum=8,
                          maximum=1000)
     time_step: float = _option(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,
@@ -133,17 +140,18 @@ class Options:
                                   unit='s', minimum=0.1, maximum=600.0)
     grip_tolerance: float = _option(
         0.02, 'an action without annotated grip is refused if no point is this near to the hand',
-        unit='m', minimum=0.0, maximum=10.0)
+        unit='m', minimum=0.0, maximum=10.0, of=OBSERVATION)
     length_tolerance: float = _option(
         50.0, 'a goal chain is refused if its length differs by more than this from the initial chain',
-        unit='%', minimum=0.0, maximum=1000.0)
+        unit='%', minimum=0.0, maximum=1000.0, of=OBSERVATION)
     release: bool = _option(
-        True, 'whether a hand opens at its last waypoint; used if goal chains have no hand field')
+        True, 'whether a hand opens at its last waypoint; used if goal chains have no hand field',
+        of=OBSERVATION)
     start_after_trials: int = _option(
         0, 'number of trials after which calibration starts by itself; 0: wait for ~/start', minimum=0,
-        maximum=1000000)
-    output_directory: str = _option('.', 'folder for the session and the result')
-    record: bool = _option(True, 'whether to record the session')
+        maximum=1000000, of=MACHINE)
+    output_directory: str = _option('.', 'folder for the session and the result', of=MACHINE)
+    record: bool = _option(True, 'whether to record the session', of=MACHINE)
     values: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -204,3 +212,8 @@ def declarations() -> Iterator[Declaration]:
         if option.name != 'values':
             yield Declaration(option.name, option.default, **option.metadata)
     yield from FIXED_VALUES.values()
+
+
+def names_of(kind: str) -> tuple[str, ...]:
+    """List the options of the OBSERVATION, the SEARCH or the MACHINE."""
+    return tuple(declaration.name for declaration in declarations() if declaration.of == kind)
