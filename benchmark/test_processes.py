@@ -91,9 +91,9 @@ def test_processes(benchmark, engine, processes):
 
 PROGRAM = """
 import json, sys, time
-from dlo_calibration.cli import main as cli
+from dlo_calibration.cli import fit, main as cli
 marks = {'imports': time.time()}
-calibrate = cli.calibrate
+calibrate = fit.calibrate
 def watched(trials, options, *, on_evaluation, **rest):
     marks['reading'] = time.time()
     def take(evaluation):
@@ -104,7 +104,7 @@ def watched(trials, options, *, on_evaluation, **rest):
         return calibrate(trials, options, on_evaluation=take, **rest)
     finally:
         marks['closing'] = time.time()
-cli.calibrate = watched
+fit.calibrate = watched
 code = cli.main(sys.argv[1:])
 marks['writing'] = time.time()
 sys.stderr.write(json.dumps(marks))

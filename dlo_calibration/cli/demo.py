@@ -21,7 +21,8 @@ import time
 from typing import Any, Callable, Iterator, Sequence
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.main import document, validated
+from dlo_calibration.cli.output import document
+from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.samples import samples

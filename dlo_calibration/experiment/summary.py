@@ -10,7 +10,8 @@ from typing import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.experiment.study import Outcome, Task
+from dlo_calibration.experiment.outcome import Outcome
+from dlo_calibration.experiment.study import Task
 from dlo_calibration.model.score import VERY_SIMILAR
 
 

@@ -13,7 +13,8 @@ from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.experiment.study import Outcome, Task
+from dlo_calibration.experiment.outcome import Outcome
+from dlo_calibration.experiment.study import Task
 from dlo_calibration.experiment.summary import complete_runs, Findings, Spread
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.drawing import as_text, blank_figure, DOTS_PER_INCH, MILLIMETRES, unwritable

@@ -23,7 +23,9 @@ from toy_simulator import Deadly, new_toy, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
+from dlo_calibration.cli.output import _finite
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
@@ -148,7 +150,7 @@ def test_fit_prints_what_it_found_where_the_disk_is_full_by_then(run, session, t
     def full(*_):
         raise InputError('file result.xml', 'No space left on device', 'room for it', 'make room')
 
-    monkeypatch.setattr(cli, 'write_result', full)
+    monkeypatch.setattr(fit, 'write_result', full)
     code, output, errors = run('fit', session, '--json', '--output', tmp_path / 'out', '--evaluations', 3)
     assert code == 2
     assert 'No space left on device' in errors
@@ -329,7 +331,7 @@ def test_module_is_the_command(session):
 
 
 def test_infinity_is_null_in_json():
-    assert cli._finite({'a': [math.inf, 1.0], 'b': float('nan')}) == {'a': [None, 1.0], 'b': None}
+    assert _finite({'a': [math.inf, 1.0], 'b': float('nan')}) == {'a': [None, 1.0], 'b': None}
 
 
 def test_output_folder_may_be_that_of_the_session(run, session, tmp_path):

@@ -53,7 +53,7 @@ def run(capsys):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Draw no pictures, which take longer than all the rest."""
-    monkeypatch.setattr('dlo_calibration.cli.experiment.session_picture', lambda *_: None)
+    monkeypatch.setattr('dlo_calibration.experiment.conduct.session_picture', lambda *_: None)
     monkeypatch.setattr('dlo_calibration.experiment.tables.scatter_picture', lambda *_: None)
 
 

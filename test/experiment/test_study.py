@@ -15,17 +15,9 @@ from toy_simulator import ToySimulator
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.experiment.study import (
-    Journal,
-    judged_chains,
-    Judgement,
-    Observed,
-    Outcome,
-    perform,
-    Subject,
-    Task,
-    tasks,
-)
+from dlo_calibration.experiment.journal import Journal
+from dlo_calibration.experiment.outcome import judged_chains, Judgement, Outcome, perform
+from dlo_calibration.experiment.study import Observed, Subject, Task, tasks
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.trial import Trial
 

@@ -8,7 +8,8 @@ import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.experiment.study import Judgement, Observed, Outcome, Subject, Task
+from dlo_calibration.experiment.outcome import Judgement, Outcome
+from dlo_calibration.experiment.study import Observed, Subject, Task
 from dlo_calibration.experiment.summary import Spread, summary
 
 OPTIONS = Options.of({'calibrate': ['friction', 'elasticity']})

@@ -20,7 +20,7 @@ from wrong_input import mutations
 
 from dlo_calibration import calibrate, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli import main as cli
+from dlo_calibration.cli import fit
 from dlo_calibration.files import recording
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INITIAL
@@ -250,7 +250,7 @@ def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, co
     monkeypatch.setattr(Path, 'write_bytes', lambda p, *a, **k: refuse(p) or write_bytes(p, *a, **k))
     monkeypatch.setattr(Path, 'open', lambda p, *a, **k: refuse(p) or fopen(p, *a, **k))
     monkeypatch.setattr(shutil, 'copyfile', lambda a, b: refuse(b) or copyfile(a, b))
-    monkeypatch.setattr(cli, 'calibrate',
+    monkeypatch.setattr(fit, 'calibrate',
                         lambda *args, **rest: done.append(1) or calibrate(*args, **rest))
     code, result, errors = command('fit', path, '--json', '--output', tmp_path / 'out')
     assert (code, result['trials']) == (2, 2)

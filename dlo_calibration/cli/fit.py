@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `fit`: finds the parameter set that explains a session, and writes it down."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import shutil
+import sys
+from typing import Callable, Sequence
+
+from dlo_calibration.calibration.calibrate import calibrate
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.stages import sliced
+from dlo_calibration.cli.options import given_options
+from dlo_calibration.cli.output import print_result, tell
+from dlo_calibration.cli.source import add_source, read_source, Source
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.result import write_result
+from dlo_calibration.files.session import trial_records
+from dlo_calibration.signals import StopFlag
+
+TEXT = 'find the parameter set that explains a session'
+RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
+REQUEST = 'request.xml'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb understands."""
+    add_source(parser)
+    parser.add_argument('--output', metavar='DIR', type=Path,
+                        help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} there')
+
+
+def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """Do what the verb says; return the exit code."""
+    from dlo_calibration.report.terminal import SearchBar
+
+    source = read_source(chosen, tell).require_trials()
+    folder = chosen.output
+    if folder is None and 'output_directory' in given_options(chosen):
+        folder = Path(source.options.output_directory)
+    files = [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
+    if folder is not None:
+        _make_folder(folder, files)
+    told: list[str] = []
+
+    def warn_once(text: str) -> None:
+        if text not in told:
+            tell(f'warning: {text}')
+            told.append(text)
+
+    with StopFlag() as stop:
+        with SearchBar(source.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
+            try:
+                result = calibrate(
+                    source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
+                    should_stop=stop, make_simulator=make_simulator)
+            except SimulationError:
+                if not stop():
+                    raise
+                raise KeyboardInterrupt from None
+        try:
+            if folder is not None:
+                _write_files(folder, source, result, make_simulator, stop)
+                tell(f'{", ".join(files)} are in {folder}')
+        finally:  # a disk that is full by now must not lose what was found
+            print_result(result, chosen.json, told)
+    return 0
+
+
+def _make_folder(folder: Path, names: Sequence[str]) -> None:
+    """Make a folder in which files of these names can be written, before hours are spent on a search."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            with (folder / name).open('ab'):
+                pass
+    except OSError as error:
+        raise InputError(f'folder {folder}', str(error), 'a folder that can be written to',
+                         'choose another one with --output') from error
+
+
+def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,
+                 should_stop: Callable[[], bool]) -> None:
+    """Write a result, and what it was found from, into a folder."""
+    from dlo_calibration.report.page import (
+        digests,
+        Origin,
+        repeating_command,
+        write_evaluations,
+        write_report,
+    )
+
+    write_result(folder / RESULT, result, source.options.flat())
+    _write_session(folder / SESSION, source)
+    if source.is_request:
+        _copy(source.path, folder / REQUEST)
+    write_evaluations(folder / EVALUATIONS, result)
+    repeated = REQUEST if source.is_request else SESSION
+    origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
+                    digests([*_recorded(source.path), folder / repeated]),
+                    [*source.session.problems, *source.refusals])
+    slices = sliced(result, source.options, make_simulator, should_stop)
+    write_report(folder / REPORT, result, origin, slices)
+
+
+def _recorded(path: Path) -> list[Path]:
+    """List the files that hold the messages of a session."""
+    return [path] if path.is_file() else sorted(one for one in path.iterdir()
+                                                if one.suffix in ('.mcap', '.db3', '.zstd'))
+
+
+def _write_session(path: Path, source: Source) -> None:
+    """
+    Copy a session into one MCAP file; one that is already such a file, byte by byte.
+
+    Of a request, the messages are written that a robot would have sent.
+    """
+    files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
+    try:
+        if len(files) == 1 and files[0].suffix == '.mcap':
+            _copy(files[0], path)
+            return
+        records, options = source.session.records, source.session.recorded
+        if source.is_request:
+            records, options = trial_records(source.trials), source.options.flat()
+        writer = SessionWriter(path.with_name(f'{path.name}.new'), options)
+        with writer:
+            for record in records:
+                writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
+        writer.file.replace(path)
+        shutil.rmtree(writer.path)
+    except OSError as error:
+        raise InputError(f'file {path}', str(error), 'a place that can be written to',
+                         'choose another one with --output') from error
+
+
+def _copy(source: Path, target: Path) -> None:
+    if not (target.exists() and target.samefile(source)):
+        shutil.copyfile(source, target)

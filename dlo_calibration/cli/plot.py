@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `plot`: draws each trial, as measured, and as simulated with a result."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+import sys
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.cli.output import print_json, tell
+from dlo_calibration.cli.source import add_source, read_source
+from dlo_calibration.cli.validate import validated
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.result import read_result
+
+TEXT = 'draw a picture of each trial: measured, and simulated with a result'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb understands."""
+    add_source(parser)
+    parser.add_argument('result', metavar='RESULT.xml', type=Path, nargs='?',
+                        help='simulate with its parameters; without it, only what was measured is drawn')
+    parser.add_argument('--output', metavar='DIR', type=Path, default=Path(),
+                        help='write trial_1.png, ... there; default: the current folder')
+    parser.add_argument('--animation', action='store_true',
+                        help='also write trial_1.gif, ...: how the simulated DLO moves')
+
+
+def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """Do what the verb says; return the exit code."""
+    from dlo_calibration.report.plot import write_animations, write_pictures
+
+    if chosen.animation and chosen.result is None:
+        raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
+                         'name a result: dlo-calibration plot SESSION RESULT.xml --animation')
+    file = None if chosen.result is None else read_result(chosen.result)
+    source = read_source(chosen, tell, None if file is None else file.options).require_trials()
+    result = None if file is None else validated(file, source.trials, source.options, make_simulator)
+    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell)
+    animations: list[Path] = []
+    if chosen.animation and result is not None:
+        physical = result.space.physical(result.values, result.length)
+        with closing(make_simulator(source.options)) as simulator:
+            animations = write_animations(source.trials, simulator, physical, chosen.output, tell)
+    if chosen.json:
+        print_json({'pictures': [str(path) for path in pictures],
+                    'animations': [str(path) for path in animations]}, sys.stdout)
+    return 0

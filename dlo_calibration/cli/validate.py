@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `validate`: simulates trials with the parameters of a result; nothing is fitted."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+import time
+from typing import Sequence
+
+from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
+from dlo_calibration.calibration.stages import confirmed
+from dlo_calibration.cli.output import print_result, tell
+from dlo_calibration.cli.source import add_source, read_source
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.files.result import Description, read_result
+from dlo_calibration.model.trial import Trial
+
+TEXT = 'simulate a session with the parameters of a result; fit nothing'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the verb understands."""
+    parser.add_argument('result', metavar='RESULT.xml', type=Path)
+    add_source(parser)
+
+
+def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """Do what the verb says; return the exit code."""
+    file = read_result(chosen.result)
+    source = read_source(chosen, tell, file.options).require_trials()
+    result = validated(file, source.trials, source.options, make_simulator)
+    print_result(confirmed(result, source.options, make_simulator), chosen.json)
+    return 0
+
+
+def validated(file: Description, trials: Sequence[Trial], options: Options,
+              make_simulator: SimulatorFactory = make_chosen_simulator) -> CalibrationResult:
+    """
+    Simulate trials with the parameters of a result; nothing is fitted.
+
+    :returns: as of a calibration that tried this parameter set only, with the
+        result's own parameters and intervals.
+    :raises SimulationError: where a trial cannot be simulated.
+    """
+    with closing(make_simulator(options)) as simulator:
+        begun = time.monotonic()
+        evaluation = Evaluator(trials, file.space, simulator).evaluate(0, file.space.point(file.values))
+        seconds = time.monotonic() - begun
+    if evaluation.failure:
+        raise SimulationError(evaluation.failure)
+    warnings = tuple(f'never came to rest: {name}; compared as it was at the limit'
+                     for name in evaluation.unsettled)
+    return CalibrationResult(
+        space=file.space, parameters=file.parameters, best=evaluation, trials=tuple(trials),
+        chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
+        seconds=seconds, search=file.search, engine=simulator.name,
+        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings)

@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Conduct: performs what an experiment has not done yet, and writes its tables and pictures."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, wait
+from contextlib import closing
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import time
+from typing import Callable, Iterator, Sequence, TextIO
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.processes import cores, ProcessExecutor
+from dlo_calibration.experiment import tables
+from dlo_calibration.experiment.journal import Journal
+from dlo_calibration.experiment.outcome import judged_chains, Outcome, perform
+from dlo_calibration.experiment.study import Subject, Task, tasks
+from dlo_calibration.experiment.summary import complete_runs, run_score, summary
+from dlo_calibration.report.drawing import session_picture
+from dlo_calibration.report.terminal import TaskBar
+from dlo_calibration.search import SEARCHES
+
+LOOK = 0.1  # s between two looks at whether to stop
+NOTE_PERIOD = 30.0  # s between two lines of progress where there is no terminal
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What an experiment does.
+
+    :param runs: calibrations of each subject with each search, each with a seed of its own.
+    :param seed: of the first run.
+    :param evaluations: of a search at most; for the tables.
+    :param workers: processes; 0: one per core.
+    :param command: the command that repeats the experiment.
+    :param samples: whether the subjects are the samples of the package.
+    """
+
+    subjects: tuple[Subject, ...]
+    searches: tuple[str, ...]
+    runs: int
+    seed: int
+    evaluations: int
+    workers: int
+    command: str
+    samples: bool
+
+    def __post_init__(self) -> None:
+        if self.runs < 1:
+            raise InputError('--runs', str(self.runs), '1 or more', 'correct it')
+        if not self.searches:
+            raise InputError('--search', 'no name', f'one or more of {", ".join(SEARCHES)}', 'name one')
+
+
+def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
+            note: Callable[[str], None], stream: TextIO) -> tables.Account | None:
+    """
+    Do the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
+
+    Where it is stopped, they show what is done by then.
+
+    :param note: called with each sentence for the user.
+    :param stream: for a progress bar.
+    :returns: None where nothing is done.
+    :raises InputError: where `folder` cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f'folder {folder}', str(error), 'a folder that can be written to',
+                         'choose another one with --output') from error
+    journal = Journal(folder / 'calibrations.jsonl')
+    engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
+    wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
+    _perform_all([task for task in wanted if journal.find(task) is None], len(wanted), plan.workers,
+                 journal, make_simulator, stop, note, stream)
+    done = [(task, outcome) for task in wanted if (outcome := journal.find(task)) is not None]
+    groups = [group for subject in plan.subjects for search in plan.searches
+              if complete_runs(group := [one for one in done if one[0].subject is subject
+                                         and one[0].search == search])]
+    if not groups:
+        return None
+    account = tables.Account(
+        tuple(summary(group) for group in groups), plan.command, ', '.join(dict.fromkeys(engines.values())),
+        plan.runs, plan.evaluations, plan.samples, complete=len(done) == len(wanted))
+    for name, text in (
+            ('experiment.md', tables.markdown(account)),
+            ('experiment.json', json.dumps(tables.document(account), indent=2, allow_nan=False) + '\n'),
+            ('consistency.csv', tables.consistency_csv(account)),
+            ('validity.csv', tables.validity_csv(account)), ('calibrations.csv', tables.runs_csv(done))):
+        _write(folder / name, text)
+    tables.scatter_picture(groups, folder / 'parameters.png')
+    for group in groups:
+        _draw(group, folder, make_simulator)
+    note(f'tables and pictures are in {folder}')
+    if not account.complete:
+        note(f'interrupted: {len(done)} of {len(wanted)} calibrations are done; '
+             'the same command goes on from there')
+    return account
+
+
+def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
+    """Prepare the engine of an object, e.g. compile it; return its name."""
+    with closing(make_simulator(subject.observed.options)) as simulator:
+        simulator.prepare()
+        return simulator.name
+
+
+def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Journal,
+                 make_simulator: SimulatorFactory, stop: Callable[[], bool], note: Callable[[str], None],
+                 stream: TextIO) -> None:
+    """Do tasks, each in one process, and write down each as it is done."""
+    if not waiting:
+        return
+    if len(waiting) < total:
+        note(f'{total - len(waiting)} of {total} calibrations are done already')
+    begun = told = time.monotonic()
+    with TaskBar('calibrations', total, total - len(waiting), stream) as bar:
+        outcomes = _outcomes(waiting, min(workers or cores(), len(waiting)), make_simulator, stop, note)
+        for count, (task, outcome) in enumerate(outcomes, start=1):
+            journal.add(task, outcome)
+            bar.advance()
+            now = time.monotonic()
+            if not bar.shown and now - told > NOTE_PERIOD:
+                told = now
+                left = (now - begun) / count * (len(waiting) - count)
+                note(f'{total - len(waiting) + count} of {total} calibrations; {left:.0f} s left')
+
+
+def _outcomes(waiting: Sequence[Task], workers: int, make_simulator: SimulatorFactory,
+              stop: Callable[[], bool], note: Callable[[str], None]) -> Iterator[tuple[Task, Outcome]]:
+    """Yield tasks as they are done; end early when stopped."""
+    if workers == 1:
+        for task in waiting:
+            try:
+                yield task, perform(task, make_simulator, stop)
+            except CancelledError:
+                return
+        return
+    with closing(ProcessExecutor(workers, note)) as executor:
+        futures: dict[Future[Outcome], Task] = {
+            executor.submit(perform, task, make_simulator): task for task in waiting}
+        while futures and not stop():
+            for future in wait(futures, LOOK, FIRST_COMPLETED).done:
+                yield futures.pop(future), future.result()
+
+
+def _draw(group: Sequence[tuple[Task, Outcome]], folder: Path, make_simulator: SimulatorFactory) -> None:
+    """Draw the actions that a run is judged by, of the run whose score is the median."""
+    scored = sorted(((score, found) for found in complete_runs(group)
+                     if (score := run_score(found)) is not None), key=lambda one: one[0])
+    if not scored:
+        return
+    _, found = scored[(len(scored) - 1) // 2]
+    shown = [one for task, outcome in found if not outcome.failure
+             for one in judged_chains(task, outcome, make_simulator)]
+    if shown:
+        trials, chains = zip(*shown, strict=True)
+        session_picture(trials, chains, folder / f'{group[0][0].subject.name}_{group[0][0].search}.png')
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise InputError(f'file {path}', str(error), 'a place that can be written to',
+                         'choose another one with --output') from error
