@@ -4,8 +4,8 @@
 """
 OptionsNode: a ROS node whose parameters are the options of the package.
 
-Names, types, descriptors and ranges come from the declarations in `config`;
-what is not declared there, or out of range, is refused.
+Names, types, descriptors and ranges come from the declarations of the options;
+an unknown name and a value out of range are refused.
 """
 
 from __future__ import annotations

@@ -1,0 +1,366 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the node knows and decides, without a graph."""
+
+from collections import defaultdict
+import time
+
+import pytest
+from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
+from toy_simulator import ToySimulator
+
+from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.bag import encode
+from dlo_calibration.files.recording import typestore
+from dlo_calibration.files.result import read_description
+from dlo_calibration.files.session import read_session
+from dlo_calibration.messages.codec import bag_types, INITIAL, INPUT_TYPES
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
+from dlo_calibration.ros.session import CalibrationSession
+
+PATIENCE = 60.0  # s
+TYPES = bag_types()
+
+
+def values(status):
+    return {pair.key: pair.value for pair in status.values}
+
+
+def whole(result):
+    return values(next(one for one in result.status if one.name == 'calibration'))
+
+
+class ToyGraph:
+    """A graph in which whatever is published is heard at once; `ahead` [s] lets time pass."""
+
+    def __init__(self, folder, make, **options):
+        self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
+        self.ahead = 0.0
+        self.heard, self.logged, self.waiting = defaultdict(list), defaultdict(list), []
+        self.info, self.warn, self.error = (self.logged[level].append for level in ('info', 'warn', 'error'))
+        self.session = CalibrationSession(self, TYPES, make, lambda: time.monotonic() + self.ahead)
+
+    def options(self):
+        return Options.of({**Options().flat(), **self.set})
+
+    def stamp(self):
+        return MINUTE
+
+    def topic(self, name):
+        return f'/calibrator/{name}'
+
+    def decode(self, kind, octets):
+        return typestore().deserialize_cdr(octets, INPUT_TYPES[kind])
+
+    def encode(self, name, message):
+        return encode(message, OUTPUT_TYPES[name])
+
+    def publish(self, name, octets):
+        self.heard[name].append(typestore().deserialize_cdr(octets, OUTPUT_TYPES[name]))
+
+    def hear_waiting(self):
+        pairs, self.waiting = self.waiting, []
+        self.send(pairs)
+
+    def send(self, pairs):
+        for kind, message in pairs:
+            self.session.hear(kind, encode(message, INPUT_TYPES[kind]))
+        self.session.tick()
+
+    def until(self, condition):
+        begun = time.monotonic()
+        while not condition():
+            assert time.monotonic() - begun < PATIENCE, self.status
+            self.session.tick()
+            time.sleep(0.002)
+
+    @property
+    def status(self):
+        return values(self.heard['status'][-1].status[0])
+
+    def calibrated(self):
+        """Start, and return the result."""
+        before = len(self.heard['result'])
+        done, answer = self.session.request('start')
+        assert done, answer
+        self.until(lambda: self.status['state'] != 'calibrating')
+        assert self.status['state'] == 'done', self.status
+        assert len(self.heard['result']) == before + 1
+        return self.heard['result'][-1]
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Give a function that begins a session with the toy, and returns its graph."""
+    graphs = []
+
+    def start(toy=None, make=None, kind=ToyGraph, **options):
+        toy = toy or ToySimulator()
+        graphs.append(kind(tmp_path, make or (lambda _: toy), **options))
+        return graphs[-1]
+
+    yield start
+    for graph in graphs:
+        graph.session.close()
+
+
+def folders(path):
+    return sorted(path.glob('dlo_session_*'))
+
+
+def score(command, folder):
+    """Return the score that `fit` finds in a session, as a result message has it."""
+    code, found, _ = command('fit', folder, '--json')
+    assert code == 0
+    return repr(found['score'])
+
+
+def test_whatever_is_heard_is_on_the_disk_already(start, tmp_path):
+    class Suspicious(ToyGraph):
+        def publish(self, name, octets):
+            folder, = folders(tmp_path)
+            record = read_session(folder).records[-1] if self.heard['status'] else None
+            assert record is None or (record.name, record.data) == (name, octets)
+            super().publish(name, octets)
+
+    graph = start(kind=Suspicious, evaluations=3)
+    graph.send(session_messages(TYPES, 1))
+    graph.calibrated()
+    assert set(graph.heard) == set(OUTPUT_TYPES)
+
+
+def test_start_without_a_complete_trial_is_refused_and_says_what_is_missing(start):
+    graph = start()
+    done, answer = graph.session.request('start')
+    assert not done
+    assert 'initial_chain' in answer
+    graph.send(session_messages(TYPES, 1)[:2])
+    assert 'goal_chain' in graph.status['incomplete']
+    done, answer = graph.session.request('start')
+    assert not done
+    assert 'goal_chain' in answer
+    assert graph.status['last_refusal'] == answer == graph.logged['warn'][-1]
+    graph.waiting = session_messages(TYPES, 1)[2:]  # sent before the request, and not heard yet
+    assert whole(graph.calibrated())['trials'] == '1'
+
+
+def test_what_comes_after_the_start_is_for_the_next_one(start, tmp_path, command):
+    graph = start(ToySimulator(0.002))
+    graph.send(session_messages(TYPES, 1))
+    graph.session.request('start')
+    graph.send(session_messages(TYPES, 1, first=1))
+    assert (graph.status['state'], graph.status['trials']) == ('calibrating', '2')
+    graph.until(lambda: graph.status['state'] == 'done')
+    first, = graph.heard['result']
+    assert whole(first)['trials'] == '1'
+    folder, = folders(tmp_path)
+    assert score(command, folder) == whole(first)['score']
+    second = graph.calibrated()
+    assert whole(second)['trials'] == '2'
+    assert score(command, folder) == whole(second)['score']
+    assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_2.xml'}
+    graph.session.close()
+    assert {file.name for file in folder.glob('*.html')} == {'report.html', 'report_2.html'}
+
+
+def test_requests_that_do_not_fit_are_refused_and_stop_gives_the_best_so_far(start):
+    graph = start(ToySimulator(0.01), evaluations=10000)
+    graph.send(session_messages(TYPES, 1))
+    assert not graph.session.request('stop')[0]
+    assert graph.session.request('start')[0]
+    for refused in ('start', 'reset'):
+        done, answer = graph.session.request(refused)
+        assert not done
+        assert 'under way' in answer
+    graph.until(lambda: graph.heard['progress'])
+    assert graph.session.request('stop')[0]
+    graph.until(lambda: graph.status['state'] == 'done')
+    assert graph.status['detail'] == whole(graph.heard['result'][0])['stop_reason'] == 'stopped on request'
+
+
+def test_reset_forgets_the_trials_and_begins_another_session(start, tmp_path, command):
+    graph = start()
+    graph.send(session_messages(TYPES, 2))
+    assert graph.status['trials'] == '2'
+    assert graph.session.request('reset')[0]
+    assert (graph.status['trials'], graph.status['last_refusal']) == ('0', '')
+    graph.send(session_messages(TYPES, 1))
+    live = graph.calibrated()
+    first, second = folders(tmp_path)
+    assert score(command, second) == whole(live)['score']
+    assert len(read_session(first).messages) == 6
+
+
+def bad_cloud():
+    (_, cloud), *_ = session_messages(TYPES, 1, first=5)
+    cloud.header.stamp.sec = cloud.header.stamp.nanosec = 0
+    return encode(cloud, INPUT_TYPES[INITIAL])
+
+
+def foreign_frame():
+    (_, cloud), *_ = trial_messages(TYPES, toy_trials(1)[0], 9 * MINUTE, 'camera')
+    return encode(cloud, INPUT_TYPES[INITIAL])
+
+
+@pytest.mark.parametrize(('octets', 'words'), [
+    (bad_cloud, ('stamp of zero', 'header.stamp')), (foreign_frame, ('camera', 'world')),
+    (lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2')),
+], ids=['stamp of zero', 'another frame', 'damaged bytes'])
+def test_what_is_refused_is_told_once_and_the_trials_stay(start, octets, words):
+    graph = start()
+    graph.send(session_messages(TYPES, 1))
+    graph.session.hear(INITIAL, octets())
+    for word in ('initial_chain', *words):
+        assert word in graph.status['last_refusal']
+    assert graph.logged['warn'] == [graph.status['last_refusal']]
+    assert whole(graph.calibrated())['trials'] == '1'
+    assert graph.logged['warn'].count(graph.status['last_refusal']) == 1
+
+
+def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):
+    graph = start(start_after_trials=2)
+    graph.send(session_messages(TYPES, 2))
+    assert graph.status['state'] == 'collecting'
+    graph.ahead += 1.0
+    graph.until(lambda: graph.heard['result'])
+    assert whole(graph.heard['result'][0])['trials'] == '2'
+    graph.send(session_messages(TYPES, 1, first=2))
+    graph.ahead += 1.0
+    graph.session.tick()
+    assert graph.status['state'] == 'collecting'
+
+
+def test_starts_by_itself_at_once_when_one_more_trial_is_complete(start):
+    graph = start(start_after_trials=1)
+    graph.send(session_messages(TYPES, 2))
+    assert graph.status['state'] == 'calibrating'
+
+
+def test_failure_of_the_engine_reaches_status_and_the_session_goes_on(start):
+    toy = ToySimulator(crash=True)
+    graph = start(toy)
+    graph.send(session_messages(TYPES, 1))
+    assert graph.session.request('start')[0]
+    graph.until(lambda: graph.status['state'] == 'failed')
+    assert graph.status['detail'] == 'RuntimeError: the toy is broken'
+    assert graph.logged['error'][0] == 'calibration failed: RuntimeError: the toy is broken'
+    assert 'Traceback' in graph.logged['error'][1]
+    toy.crash = False
+    graph.calibrated()
+
+
+def test_a_scene_that_cannot_be_used_is_refused_at_the_start(start):
+    graph = start(make=make_simulator, scene='nowhere.urdf')
+    graph.send(session_messages(TYPES, 1))
+    done, answer = graph.session.request('start')
+    assert not done
+    assert answer.startswith('scene nowhere.urdf: got ')
+    assert (graph.status['state'], graph.status['last_refusal']) == ('collecting', answer)
+
+
+def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start):
+    graph = start(make=make_simulator, scene='nowhere.urdf', start_after_trials=1)
+    graph.send(session_messages(TYPES, 1))
+    graph.ahead += 1.0
+    graph.session.tick()
+    assert graph.status['state'] == 'failed'
+    assert graph.status['detail'].startswith('scene nowhere.urdf: got ')
+    assert graph.status['detail'] == graph.status['last_refusal']
+
+
+def test_disk_that_refuses_is_reported_and_the_session_goes_on(start, tmp_path):
+    taken = tmp_path / 'file'
+    taken.write_text('not a folder')
+    graph = start(output_directory=str(taken))
+    assert str(taken) in graph.status['last_refusal']
+    graph.send(session_messages(TYPES, 1))
+    graph.calibrated()
+
+
+def test_nothing_is_written_where_recording_is_off(start, tmp_path):
+    graph = start(record=False)
+    graph.send(session_messages(TYPES, 1))
+    graph.calibrated()
+    graph.session.close()
+    assert not folders(tmp_path)
+
+
+def test_changed_options_count_at_the_next_start_and_in_the_replay(start, tmp_path, command):
+    graph = start(grip_tolerance=0.0)
+    pairs = trial_messages(TYPES, toy_trials(1)[0], MINUTE)
+    for point in pairs[1][1].points:
+        point.transforms[0].translation.z += 0.01  # the hand closes 1 cm above the point
+    graph.send(pairs)
+    assert 'grip_tolerance' in graph.status['last_refusal']
+    graph.set.update(grip_tolerance=0.05, evaluations=12)
+    live = whole(graph.calibrated())
+    assert live['evaluations'] == '12'
+    assert score(command, folders(tmp_path)[0]) == live['score']
+
+
+def test_description_of_the_dlo_is_the_text_of_the_result_file(start, tmp_path):
+    graph = start(mass=0.03)
+    graph.send(session_messages(TYPES, 1))
+    live = result_values(graph.calibrated())
+    text, = (message.data for message in graph.heard['dlo_description'])
+    assert {name: one.physical_value for name, one in read_description(text).parameters.items()} == {
+        name: one['physical_value'] for name, one in live.items()}
+    folder, = folders(tmp_path)
+    assert text == (folder / 'result.xml').read_text(encoding='utf-8')
+
+
+def test_markers_show_trials_not_too_often_and_then_what_was_simulated(start):
+    graph = start()
+
+    def shown():
+        return {one.ns for one in graph.heard['markers'][-1].markers}
+
+    graph.send(session_messages(TYPES, 1))
+    graph.send(session_messages(TYPES, 1, first=1))
+    assert len(graph.heard['markers']) == 1
+    assert 'trial_2/goal' not in shown()
+    graph.ahead += 1.3
+    graph.session.tick()
+    assert {f'trial_{k}/{name}' for k in (1, 2) for name in ('initial', 'goal', 'hands')} <= shown()
+    assert not any(space.endswith('/simulated') for space in shown())
+    graph.calibrated()
+    assert {'trial_1/simulated', 'trial_2/simulated'} <= shown()
+    graph.send(session_messages(TYPES, 1, first=2))
+    graph.ahead += 1.4
+    graph.session.tick()
+    assert 'trial_3/goal' in shown() and 'trial_1/simulated' in shown()
+    assert 'trial_3/simulated' not in shown()
+    graph.session.request('reset')
+    assert not any(shown())
+
+
+def test_status_says_whether_a_trial_added_information(start, tmp_path, command):
+    graph = start(seed=3)
+    graph.send(session_messages(TYPES, 1))
+    graph.ahead += 1.0
+    graph.until(lambda: graph.status['last_trial'])
+    assert graph.status['last_trial'].startswith('trial 1 tells flexibility (')
+    assert graph.heard['status'][-1].status[0].message.endswith(graph.status['last_trial'])
+    assert float(graph.status['std_after_flexibility']) < 0.5 * float(graph.status['std_before_flexibility'])
+    graph.send(trial_messages(TYPES, toy_trials(1)[0], 2 * MINUTE))  # the same again
+    graph.ahead += 1.0
+    graph.until(lambda: graph.status['last_trial'].startswith('trial 2'))
+    assert graph.status['last_trial'] == 'trial 2 adds nothing new: repeat it only to average noise'
+    live = graph.calibrated()
+    folder, = folders(tmp_path)
+    assert score(command, folder) == whole(live)['score']
+    assert graph.session.request('reset')[0]
+    assert (graph.status['last_trial'], graph.status['trials']) == ('', '0')
+
+
+def test_a_reset_while_a_trial_is_appraised_forgets_it(start):
+    graph = start(ToySimulator(1000.0))
+    graph.send(session_messages(TYPES, 1))
+    graph.ahead += 1.0
+    appraiser = graph.session._appraiser
+    graph.until(lambda: appraiser.alive)
+    assert graph.session.request('reset')[0]
+    graph.until(lambda: not appraiser.alive)
+    assert (graph.status['last_trial'], graph.status['trials']) == ('', '0')
