@@ -26,7 +26,7 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import least_squares
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.search import Hints, LeastSquares, Observation

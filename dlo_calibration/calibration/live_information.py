@@ -23,7 +23,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.evaluation.evaluation import mean_length
+from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.inference.trial_information import (
     covers,

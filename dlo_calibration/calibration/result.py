@@ -13,7 +13,8 @@ import numpy as np
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.evaluation.evaluation import Evaluation, mean_length
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.examination import Examination

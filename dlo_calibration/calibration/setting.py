@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from typing import Callable
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator, Everywhere
+from dlo_calibration.evaluation.batch import BatchEvaluator
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Simulator
@@ -41,7 +43,7 @@ class Setting:
         return self.options.parts == 0 and len(self.trials) > 1 and 'flexibility' in self.options.calibrate
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
-                 simulator: Simulator | None = None) -> Everywhere:
+                 simulator: Simulator | None = None) -> BatchEvaluator:
         """Return what evaluates points of a space, on the trials with the engine unless others are given."""
         evaluator = Evaluator(trials or self.trials, space, simulator or self.simulator)
-        return Everywhere(evaluator, self.should_stop, self.executor)
+        return BatchEvaluator(evaluator, self.should_stop, self.executor)

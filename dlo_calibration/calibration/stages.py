@@ -18,7 +18,7 @@ from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import DloCalibrationError, SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.missing_parameters import explanations

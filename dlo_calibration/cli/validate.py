@@ -19,7 +19,7 @@ from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli.output import print_result, tell
 from dlo_calibration.cli.source import add_source, read_source
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.trial import Trial
 

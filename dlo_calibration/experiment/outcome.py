@@ -16,7 +16,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.experiment.study import Observed, Task
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial

@@ -10,7 +10,7 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
 from dlo_calibration.model.trial import Trial

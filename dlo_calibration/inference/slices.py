@@ -13,7 +13,8 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.inference.outcome import Calibrated
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE

@@ -11,7 +11,7 @@ import pytest
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace

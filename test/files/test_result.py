@@ -16,7 +16,7 @@ from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import (
     Description,
     description_document,

@@ -10,7 +10,7 @@ import pytest
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import prior
-from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.search.huber import Huber

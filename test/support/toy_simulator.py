@@ -14,7 +14,7 @@ from typing import Mapping, Sequence
 import numpy as np
 
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
-from dlo_calibration.evaluation.evaluation import mean_length
+from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.simulation.protocol import Rollout

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Batch: many parameter sets evaluated in order, here or wherever an executor says.
+
+A simulator lives in the process and the thread that uses it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, Executor, Future
+import copy
+import pickle
+import threading
+from typing import Callable, Iterator, Sequence
+import uuid
+import weakref
+
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.model.chain import Floats
+
+
+class BatchEvaluator:
+    """
+    Evaluates batches of points in order, wherever the executor says.
+
+    Once stopped, a batch ends early, without an error.
+    """
+
+    def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
+                 executor: Executor | None) -> None:
+        self.evaluator = evaluator
+        self._should_stop = should_stop
+        self._executor = executor
+        self._parcel = _Parcel(evaluator)
+        self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
+
+    def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
+        """Evaluate (k, d) points, the first with the index `first`."""
+        if self._executor is None:
+            for k, point in enumerate(points):
+                try:
+                    yield self.evaluator.evaluate(first + k, point, self._should_stop)
+                except CancelledError:
+                    return
+            return
+        futures: list[Future[Evaluation]] = [
+            self._executor.submit(_evaluate_elsewhere, self._key, self._parcel, first + k, point)
+            for k, point in enumerate(points)]
+        try:
+            for future in futures:
+                while not future.done():
+                    if self._should_stop():
+                        return
+                    _wait(future)
+                if self._should_stop():
+                    return
+                yield future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def residuals(self, points: Floats) -> Sequence[Floats | None]:
+        """
+        Return the residuals at (k, d) points; None where a simulation failed.
+
+        :raises CancelledError: when stopped.
+        """
+        found = [evaluation.residuals for evaluation in self(points, 0)]
+        if len(found) < len(points):
+            raise CancelledError
+        return found
+
+
+def _wait(future: Future[Evaluation]) -> None:
+    try:
+        future.exception(timeout=0.05)
+    except TimeoutError:
+        pass
+
+
+class _Parcel:
+    """
+    An evaluator on its way to workers.
+
+    It is pickled once, and unpickled where it is opened: trials with thousands of
+    chains take as long for that as to be simulated.
+    """
+
+    def __init__(self, evaluator: Evaluator | None, packed: bytes = b'') -> None:
+        self._evaluator, self._packed = evaluator, packed
+
+    def open(self) -> Evaluator:
+        """Return the evaluator; here it is the same one, elsewhere a new one."""
+        if self._evaluator is None:
+            self._evaluator = pickle.loads(self._packed)  # noqa: S301  # from the process that began this one
+        assert self._evaluator is not None
+        return self._evaluator
+
+    def __reduce__(self) -> tuple[type[_Parcel], tuple[None, bytes]]:
+        self._packed = self._packed or pickle.dumps(self._evaluator, pickle.HIGHEST_PROTOCOL)
+        return _Parcel, (None, self._packed)
+
+
+class _Here(threading.local):
+    """
+    What a worker's thread keeps: the evaluator of the calibration under way.
+
+    Its simulator is closed when another calibration begins, or the thread ends.
+    """
+
+    key = ''
+    evaluator: Evaluator
+    forget: Callable[[], object] = staticmethod(lambda: None)
+
+    def of(self, key: str, parcel: _Parcel) -> Evaluator:
+        if key != self.key:
+            self.forget()
+            self.key, self.evaluator = key, copy.copy(parcel.open())
+            self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
+        return self.evaluator
+
+
+_here = _Here()
+
+
+def _evaluate_elsewhere(key: str, parcel: _Parcel, index: int, point: Floats) -> Evaluation:
+    """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
+    return _here.of(key, parcel).evaluate(index, point)

@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Evaluator: tries one parameter set on all trials."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+import copy
+from dataclasses import replace
+from typing import Callable, Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.protocol import Rollout, Simulator
+
+
+def mean_length(trials: Sequence[Trial]) -> float:
+    """Return the mean length of the DLO as the trials begin [m]."""
+    return float(np.mean([trial.initial.length for trial in trials]))
+
+
+class Evaluator:
+    """
+    Tries parameter sets on trials.
+
+    It is pickled to worker processes and copied for worker threads: see `Simulator`.
+    """
+
+    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
+        self.trials = tuple(trials)
+        self.space = space
+        self.simulator = simulator
+        self._length = mean_length(trials)
+        self._scores = tuple(TrialScore(trial) for trial in trials)
+
+    def __copy__(self) -> Evaluator:
+        """Return one with a simulator of its own."""
+        return Evaluator(self.trials, self.space, copy.copy(self.simulator))
+
+    def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
+        """Simulate every trial with free parameters on the 0..100 scale."""
+        physical = self.space.physical(values, self._length)
+        return [self.simulator.simulate(trial, physical) for trial in self.trials]
+
+    def evaluate(self, index: int, point: Floats,
+                 should_stop: Callable[[], bool] = lambda: False) -> Evaluation:
+        """
+        Try a (d,) point of the unit cube on every trial.
+
+        :raises CancelledError: as soon as `should_stop` says so, between trials.
+        """
+        point = frozen_array(point)
+        evaluation = Evaluation(index, point, self.space.values(point))
+        physical = self.space.physical(evaluation.values, self._length)
+        rollouts: list[Rollout] = []
+        for trial in self.trials:
+            if should_stop():
+                raise CancelledError
+            try:
+                rollouts.append(self.simulator.simulate(trial, physical))
+            except SimulationError as error:
+                return replace(evaluation, failure=str(error), skipped=len(self.trials) - len(rollouts) - 1)
+        evaluation = replace(
+            evaluation, scores=tuple(float(score(rollout.chains))
+                                     for score, rollout in zip(self._scores, rollouts, strict=True)),
+            unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
+                            if not all(rollout.settled)))
+        residual = np.concatenate([residuals(trial, rollout.chains)
+                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
