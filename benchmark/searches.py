@@ -23,9 +23,9 @@ from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import prior
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.search import Observation, SEARCHES
-from dlo_calibration.search.huber import Huber
 
 HERE = Path(__file__).resolve().parent
 BUDGET = 150
@@ -59,8 +59,7 @@ def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
             for one in dict.fromkeys(['random', *names])}
     target = float(np.median([min(one.score for one in seen) for seen, _ in done['random']]))
     residuals = {one: [best.residuals for _, best in found] for one, found in done.items()}
-    loss = min((Huber.of(each) for found in residuals.values() for each in found),
-               key=lambda candidate: candidate.scale)
+    loss = min(Huber.of(each) for found in residuals.values() for each in found)
     lowest = min(loss.cost(each) for found in residuals.values() for each in found)
     rows = []
     for one in names:

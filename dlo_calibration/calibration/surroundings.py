@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
-from dlo_calibration.search.huber import Huber
 
 UNLIKELY = 2.71  # chi-square, one degree of freedom, that 10 % exceed
 FURTHEST = 0.1  # that excited parameters follow those that are set to their default, in the unit cube

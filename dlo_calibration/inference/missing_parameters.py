@@ -11,10 +11,10 @@ from typing import Callable, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.search.huber import Huber
 from dlo_calibration.simulation.protocol import Simulator
 
 PARTS = 'parts'  # the name of an explanation by parts of different stiffness

@@ -11,38 +11,15 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.search.huber import Huber
 from dlo_calibration.search.protocol import Observation
 
 FIRST_RADIUS = 0.25  # of a step, in each parameter
 DAMPING = 1e-4  # of the largest column's length: enough that a parameter without effect stays
 NEAR = 0.03  # a Jacobian measured no further away than that counts as measured here
 RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
-
-
-@dataclass(frozen=True)
-class Fit:
-    """
-    What is known at the point of lowest cost.
-
-    :param point: (d,) in the unit cube.
-    :param residuals: (m,) [m] there.
-    :param jacobian: (m, d) their derivative by the parameters [m per unit cube,
-        that is per 100 of the 0..100 scale], by finite differences of
-        0.005 to 0.2 beside the point.
-    :param cost: of `loss` [m^2].
-    :param loss: its scale came from the residuals.
-    :param measured: (d,) True where a parameter had a measurable effect; the
-        others kept the value that they had.
-    """
-
-    point: Floats
-    residuals: Floats
-    jacobian: Floats
-    cost: float
-    loss: Huber
-    measured: NDArray[np.bool_]
 
 
 @dataclass
@@ -65,6 +42,11 @@ class Descent:
         return self.loss.cost(self.residuals)
 
     @property
+    def model(self) -> Linearisation:
+        """Linear model of the residuals around it."""
+        return Linearisation(self.point, self.residuals, self.jacobian)
+
+    @property
     def known_here(self) -> bool:
         """Whether the Jacobian was measured no further away than its own differences reach."""
         return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
@@ -78,20 +60,19 @@ class Descent:
         assert observation.residuals is not None
         self.point, self.residuals = observation.point, observation.residuals
         loss = Huber.of(self.residuals)
-        if loss.scale < self.loss.scale:  # never larger again, so that costs of one descent compare
+        if loss.threshold < self.loss.threshold:  # never larger again, so that costs of one descent compare
             self.loss = loss
 
     def measured(self) -> NDArray[np.bool_]:
         """(d,) True where going from 0 to 1 changes the residuals by more than their spread."""
         size = np.linalg.norm(self.jacobian, axis=0)
-        measured: NDArray[np.bool_] = size > max(self.loss.scale, 1e-9 * float(size.max(initial=0.0)))
+        measured: NDArray[np.bool_] = size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0)))
         return measured
 
     def step(self, radius: float) -> Floats:
         """Return the (d,) step to the lowest point of the model within the cube and the radius."""
         from scipy.optimize import lsq_linear
 
-        roots = self.loss.roots(self.residuals)
         free = self.measured()
         step = np.zeros(len(self.point))
         least = np.maximum(-self.point, -radius)[free]
@@ -100,10 +81,10 @@ class Descent:
         columns = np.flatnonzero(free)[movable]
         if not len(columns):
             return step
-        matrix = roots[:, None] * self.jacobian[:, columns]
+        model = self.model.columns(columns).weighted(self.loss.roots(self.residuals))
         # Only the product matters to the solution: d rows in place of m.
-        upper, rest = _reduced(matrix, -roots * self.residuals)
-        damping = DAMPING * np.linalg.norm(matrix, axis=0).max()
+        upper, rest = _reduced(model.jacobian, -model.residuals)
+        damping = DAMPING * np.linalg.norm(model.jacobian, axis=0).max()
         upper = np.concatenate([upper, damping * np.eye(len(columns))])
         rest = np.concatenate([rest, np.zeros(len(columns))])
         solution = lsq_linear(upper, rest, (least[movable], most[movable]), method='bvls')
@@ -112,7 +93,7 @@ class Descent:
 
     def predicted(self, step: Floats) -> float:
         """Return the cost [m^2] that the model promises after a (d,) step."""
-        return self.loss.cost(self.residuals + self.jacobian @ step)
+        return self.loss.cost(self.model.predicted(step))
 
     def learn(self, one: Observation, base: Floats, before: Floats) -> None:
         """Update the Jacobian so that it predicts what a step gave (Broyden's rank-one update)."""

@@ -11,9 +11,10 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.linearisation import both_sides, inward, slope
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.search.descent import Descent, Fit, NEAR
-from dlo_calibration.search.huber import Huber
+from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 
@@ -47,7 +48,7 @@ MOST_ITERATIONS = 25
 
 def lower(one: Floats, other: Floats) -> bool:
     """Return whether the first residuals [m] cost less, by the narrower of the two losses."""
-    loss = min(Huber.of(one), Huber.of(other), key=lambda candidate: candidate.scale)
+    loss = min(Huber.of(one), Huber.of(other))
     return loss.cost(one) < loss.cost(other)
 
 
@@ -75,17 +76,11 @@ class LeastSquares(PlannedSearch):
         # Contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)  # [m] root mean square, from 0 to 1
         self._lowest: Observation | None = None
-        self._fit: Fit | None = None
 
     @property
     def best(self) -> Floats | None:
         """The (d,) point of lowest robust cost; its difference score may not be the lowest."""
         return None if self._lowest is None else self._lowest.point
-
-    @property
-    def fit(self) -> Fit | None:
-        """What is known at the minimum; None while no descent has ended."""
-        return self._fit
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Take the results of the last `ask`."""
@@ -106,7 +101,7 @@ class LeastSquares(PlannedSearch):
             if not best.ended and not best.rivals(starts):
                 best = yield from self._descend(best, None, ())
             if best.ended:
-                self._keep(best)
+                self._to_lowest(best)
                 if not looked:
                     beyond = yield from self._look_beyond(best)
                     looked = True
@@ -123,7 +118,7 @@ class LeastSquares(PlannedSearch):
         if not best.ended:
             best = yield from self._descend(best, None, ())
         if not looked and not self._hints.refines:
-            self._keep(best)
+            self._to_lowest(best)
             for begun in (yield from self._look_beyond(best)):
                 descent = yield from self._descend(begun, best, ())
                 if lower(descent.residuals, best.residuals):
@@ -131,7 +126,6 @@ class LeastSquares(PlannedSearch):
             if not best.ended:
                 best = yield from self._descend(best, None, ())
         best = yield from self._polish(best)
-        self._keep(best)
         return best.ended + (f'; reached from {found} starts' if found > 1 else '')
 
     def _polish(self, here: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
@@ -142,19 +136,17 @@ class LeastSquares(PlannedSearch):
         """
         for _ in range(MOST_POLISHES):
             columns = np.flatnonzero(here.measured())
-            if not len(columns) or here.roughness < SMOOTH * here.loss.scale:
+            if not len(columns) or here.roughness < SMOOTH * here.loss.threshold:
                 break
-            least = self._least_effect[columns]
-            reach = np.clip(WIDE_STEP * np.sqrt(least.max(initial=0.0) / least), WIDE_STEP, WIDEST_STEP)
-            sides = np.repeat(columns, 2)
-            moves = np.zeros((len(sides), self._dimension))
-            moves[np.arange(len(sides)), sides] = np.stack([-reach, reach], axis=1).ravel()
-            points = np.clip(here.point + moves, 0.0, 1.0)
+            least = self._least_effect[columns].max(initial=0.0) / self._least_effect
+            reach = np.clip(WIDE_STEP * np.sqrt(least), WIDE_STEP, WIDEST_STEP)
+            points = both_sides(here.point, columns, reach)
             seen = yield points
             wide = here.jacobian.copy()
-            for k, low, high in zip(columns, seen[::2], seen[1::2], strict=True):
-                if low.residuals is not None and high.residuals is not None:
-                    wide[:, k] = (high.residuals - low.residuals) / (high.point[k] - low.point[k])
+            for j, k in enumerate(columns):
+                two = seen[2 * j:2 * j + 2]
+                column = slope([one.point[k] for one in two], [one.residuals for one in two])
+                wide[:, k] = wide[:, k] if column is None else column
             there = Descent(here.point, here.residuals, here.loss, wide, NEAR, origin=here.point)
             steps = [there.step(radius) for radius in (REACH, NEAR, NEAR / 3)]
             tried = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
@@ -219,24 +211,22 @@ class LeastSquares(PlannedSearch):
     @staticmethod
     def _in_turn(starts: Sequence[Observation]) -> list[Observation]:
         """Sort start points by their cost, all by the narrowest of their losses."""
-        loss = min((Huber.of(one.residuals) for one in starts if one.residuals is not None),
-                   key=lambda candidate: candidate.scale)
+        loss = min(Huber.of(one.residuals) for one in starts if one.residuals is not None)
         return sorted(starts, key=lambda one: loss.cost(one.residuals))
 
     @staticmethod
     def _same(one: Descent, other: Descent) -> bool:
-        loss = min(one.loss, other.loss, key=lambda candidate: candidate.scale)
+        loss = min(one.loss, other.loss)
         costs = loss.cost(one.residuals), loss.cost(other.residuals)
         both = one.measured() & other.measured()
         apart = np.abs(one.point - other.point)[both].max(initial=0.0)
         return bool(apart < SAME_PLACE or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
 
-    def _keep(self, descent: Descent) -> None:
+    def _to_lowest(self, descent: Descent) -> None:
+        """Move to where another descent came by, if that costs less and is near."""
         lowest = self._lowest
         if lowest is not None and np.abs(lowest.point - descent.point).max() <= NEAR:
-            descent.move(lowest)  # another descent came by there
-        self._fit = Fit(descent.point, descent.residuals, descent.jacobian, descent.cost,
-                        descent.loss, descent.measured())
+            descent.move(lowest)
 
     def _descend(self, here: Descent, known: Descent | None, rivals: Sequence[Observation]
                  ) -> Generator[Floats, Sequence[Observation], Descent]:
@@ -255,7 +245,7 @@ class LeastSquares(PlannedSearch):
             length = float(np.abs(step).max(initial=0.0))
             if known is not None and self._leads_nowhere(here, step, known):
                 return here
-            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.scale, MOST_ROUGHNESS))
+            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.threshold, MOST_ROUGHNESS))
             if length <= DONE_STEP or gain <= visible * here.cost:
                 if here.known_here:
                     here.ended = (
@@ -341,11 +331,11 @@ class LeastSquares(PlannedSearch):
         for _ in range(2):
             if not len(columns):
                 break
-            sizes = np.where((here.point + sizes > 1) | (here.point + sizes < 0), -sizes, sizes)
+            sizes = inward(here.point, sizes)
             told = yield np.clip(here.point + np.diag(sizes)[columns], 0.0, 1.0)
             for k, one in zip(columns, told, strict=True):
-                here.jacobian[:, k] = 0.0 if one.residuals is None else (
-                    one.residuals - here.residuals) / (one.point[k] - here.point[k])
+                column = slope((here.point[k], one.point[k]), (here.residuals, one.residuals))
+                here.jacobian[:, k] = 0.0 if column is None else column
             seen.extend(told)
             columns = columns[[one.residuals is None for one in told]]
             sizes = -sizes / 2
@@ -355,8 +345,9 @@ class LeastSquares(PlannedSearch):
         """Return the (d,) steps of finite differences that change the residuals visibly."""
         if not here.jacobian.any():
             return np.full(self._dimension, FIRST_STEP)
-        wanted = min(max(VISIBLE * here.loss.scale, STEP_OVER_ROUGHNESS * here.roughness), here.loss.scale)
+        most = here.loss.threshold
+        wanted = min(max(VISIBLE * most, STEP_OVER_ROUGHNESS * here.roughness), most)
         # Only a parameter that is weak beside the others is moved far.
-        most = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
-        sizes: Floats = np.clip(np.minimum(wanted / self._least_effect, most), SMALLEST_STEP, LARGEST_STEP)
-        return sizes
+        furthest = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
+        return np.asarray(np.clip(
+            np.minimum(wanted / self._least_effect, furthest), SMALLEST_STEP, LARGEST_STEP))

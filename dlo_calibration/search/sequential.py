@@ -10,8 +10,8 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.search.huber import Huber
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 
@@ -94,7 +94,7 @@ class Sequential(PlannedSearch):
         losses = [Huber.of(part) for part in parts if part is not None]
         if not losses:
             return np.full(len(line), np.inf)
-        loss = min(losses, key=lambda candidate: candidate.scale)
+        loss = min(losses)
         return np.array([loss.cost(part) for part in parts])
 
     def _rows(self, k: int, count: int) -> NDArray[np.bool_]:
