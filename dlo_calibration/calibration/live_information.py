@@ -26,12 +26,11 @@ from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.inference.trial_information import (
-    covers,
-    Gain,
     glimpse,
-    information,
     Knowledge,
     knowledge,
+    simulated_information,
+    TrialInformation,
 )
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
@@ -47,7 +46,8 @@ _Known = dict[tuple[bytes, int], Union[Floats, str]]
 class _Job:
     """One appraisal: what it found so far, and whether it is to stop."""
 
-    def __init__(self, gains: queue.SimpleQueue[Gain], thread: threading.Thread | None = None) -> None:
+    def __init__(self, gains: queue.SimpleQueue[TrialInformation],
+                 thread: threading.Thread | None = None) -> None:
         self.stop = threading.Event()
         self.gains = gains
         self.thread = thread
@@ -108,7 +108,7 @@ class Appraiser:
             self._job.thread.join(timeout)
         return not self.alive
 
-    def waiting_gains(self) -> Iterator[Gain]:
+    def waiting_gains(self) -> Iterator[TrialInformation]:
         """Take what was found, without waiting for more."""
         while True:
             try:
@@ -123,17 +123,19 @@ class Appraiser:
         except CancelledError:
             pass
         except Exception as error:  # whatever it is, nobody else need care
-            job.gains.put(Gain.unknown(trials[-1].name, options.space.free, _one_line(error)))
+            job.gains.put(TrialInformation.unknown(trials[-1].name, options.space.free, _one_line(error)))
 
     def _appraise(self, job: _Job, trials: Sequence[Trial], options: Options,
                   result: CalibrationResult | None, informations: _Known) -> None:
         space, height = options.space, options.table_height if options.table else None
-        done = _fingerprints(result.trials) if result is not None and covers(result) else []
+        best = None if result is None else result.best.point
+        examination = None if result is None else result.examination
+        done = _fingerprints(result.trials) if result and examination and examination.regular else []
         new = [(trial, key) for trial, key in zip(trials, _fingerprints(trials), strict=True)
                if key not in done]
         if all(key in informations for _, key in new):
             return
-        known, length = knowledge(trials, space, height, result), mean_length(trials)
+        known, length = knowledge(trials, space, height, best, examination), mean_length(trials)
         with closing(self._make_simulator(options)) as simulator, closing(ProcessExecutor(1)) as process:
             for trial, key in new:
                 fresh = key not in informations
@@ -147,10 +149,10 @@ class Appraiser:
                         informations[key] = _one_line(error)
                 found = informations[key]
                 if isinstance(found, str):
-                    gain = Gain.unknown(trial.name, known.names, found)
+                    gain = TrialInformation.unknown(trial.name, known.names, found)
                 else:
                     after = known.after(found)
-                    gain, known = Gain(trial.name, known.names, known.std, after.std), after
+                    gain, known = TrialInformation(trial.name, known.names, known.std, after.std), after
                 if fresh:
                     job.gains.put(gain)
 
@@ -159,7 +161,7 @@ def _simulated(trial: Trial, known: Knowledge, space: ParameterSpace, simulator:
                table_height: float | None) -> Floats:
     """Return the information of a trial; the work of a process."""
     with closing(simulator):
-        return information(trial, known, space, simulator, length, table_height)
+        return simulated_information(trial, known, space, simulator, length, table_height)
 
 
 def _result(job: _Job, future: Future[Any]) -> Any:

@@ -15,10 +15,11 @@ from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import mean_length
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.examination import Examination
-from dlo_calibration.inference.missing_parameters import Explanation
+from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
@@ -64,7 +65,7 @@ class CalibrationResult:
     :param chains: (g, n, 3) [m] the simulated goals of each trial.
     :param examination: of the surroundings of what was found; None where there was no time for it.
     :param advice: which action to observe next; None where none would help, or it was not asked for.
-    :param explanations: what more of the object would explain of what the fit leaves over; empty where
+    :param missing_parameters: what more of the object would explain of what the fit leaves over; empty where
         that is noise, or it was not asked for.
     """
 
@@ -83,7 +84,7 @@ class CalibrationResult:
     confirmation: Confirmation | None = None
     examination: Examination | None = None
     advice: Advice | None = None
-    explanations: tuple[Explanation, ...] = ()
+    missing_parameters: tuple[MissingParameter, ...] = ()
 
     @classmethod
     def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:
@@ -178,13 +179,9 @@ def combination(names: Sequence[str], vector: Floats) -> str:
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
     """Return the simulated (g, n, 3) [m] chains of each trial, from the residuals."""
     assert evaluation.residuals is not None
-    chains, at = [], 0
-    for trial in trials:
-        observed = np.stack([goal.chain.points for goal in trial.goals])
-        residual = evaluation.residuals[at:at + observed.size].reshape(observed.shape)
-        chains.append(frozen_array(observed + residual))
-        at += observed.size
-    return tuple(chains)
+    apart = ResidualLayout.of(trials).chains(evaluation.residuals)
+    return tuple(frozen_array(np.stack([goal.chain.points for goal in trial.goals]) + away)
+                 for trial, away in zip(trials, apart, strict=True))
 
 
 def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:

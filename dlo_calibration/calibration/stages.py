@@ -19,11 +19,11 @@ from dlo_calibration.calibration.result import CalibrationResult, simulated_chai
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
-from dlo_calibration.inference.missing_parameters import explanations
-from dlo_calibration.inference.slices import cut, Slices
-from dlo_calibration.inference.uncertainty import MODEL_ERROR
+from dlo_calibration.inference.missing_parameters import missing_parameters
+from dlo_calibration.inference.slices import cut, seconds_for, Slices
 from dlo_calibration.simulation.protocol import Simulator
 
 STOPPED_PATIENCE = 5.0  # s that a confirmation may still take once it was asked to stop
@@ -45,13 +45,12 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
     Each of them is simulated once, and only where the residuals are larger than the noise.
     """
     found, best = result.examination, result.best
-    if found is None or not found.regular or best.residuals is None or (
-            found.uncertainty.residual < MODEL_ERROR * found.noise):
+    if found is None or not found.regular or best.residuals is None or found.noise_alone:
         return result
     try:
-        return replace(result, explanations=explanations(
-            result.trials, result.space, setting.simulator, best.point, best.residuals, found.jacobian,
-            setting.should_stop))
+        return replace(result, missing_parameters=missing_parameters(
+            Evaluator(result.trials, result.space, setting.simulator),
+            Linearisation(best.point, best.residuals, found.jacobian), setting.should_stop))
     except CancelledError:
         return result
 
@@ -111,6 +110,7 @@ def sliced(result: CalibrationResult, options: Options, make_simulator: Simulato
     """
     try:
         with closing(make_simulator(options)) as simulator:
-            return cut(result, simulator, should_stop)
+            return cut(Evaluator(result.trials, result.space, simulator), result.best, result.std,
+                       result.examination, seconds=seconds_for(result.seconds), should_stop=should_stop)
     except Exception:  # whatever the engine does, there is a page
         return None

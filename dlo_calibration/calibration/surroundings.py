@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
 from dlo_calibration.model.chain import Chain, Floats
@@ -59,8 +61,8 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
     evaluate = setting.evaluate(space)
     try:
         examination = examine(
-            best.point, best.residuals, [(len(trial.goals), len(trial.initial)) for trial in trials],
-            evaluate.residuals, default=default, noise=sigma,
+            best.point, best.residuals, ResidualLayout.of(trials), evaluate.residuals,
+            default=default, noise=sigma,
             finer=None if finer is None else setting.evaluate(space, simulator=finer).residuals,
             starts=[setting.evaluate(space, others).residuals
                     for others in _other_starts(trials, sigma)] if noisy else [], thorough=thorough)
@@ -90,9 +92,9 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
 def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDArray[np.bool_]) -> Floats:
     """Return the (d,) point where the excited parameters have followed the others, by a Gauss-Newton step."""
     assert best.residuals is not None
-    roots = Huber.of(best.residuals).roots(best.residuals)
-    after = roots * (best.residuals + jacobian @ (point - best.point))
-    step = np.linalg.lstsq(roots[:, None] * jacobian[:, excited], -after, rcond=None)[0]
+    fit = Linearisation(best.point, best.residuals, jacobian)
+    there = replace(fit, residuals=fit.predicted(point - best.point))
+    step = there.columns(excited).weighted(Huber.of(best.residuals).roots(best.residuals)).step()
     moved = np.array(point)
     moved[excited] = np.clip(point[excited] + np.clip(step, -FURTHEST, FURTHEST), 0.0, 1.0)
     return moved

@@ -111,7 +111,7 @@ def both_sides(point: Floats, columns: Iterable[int | np.intp], steps: Floats) -
     return np.array(beside).reshape(-1, len(point))
 
 
-def slope(values: Sequence[float], seen: Sequence[Floats | None]) -> Floats | None:
+def slope(values: Iterable[float], seen: Sequence[Floats | None]) -> Floats | None:
     """
     Return the (m,) derivative between the outermost of some values of a parameter.
 

@@ -20,6 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.linearisation import (
+    both_sides,
+    information,
+    slope,
+    standard_deviations,
+    STEP,
+    WIDEST,
+)
 from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
@@ -29,7 +37,6 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.simulation.protocol import Simulator
 
-SMALLEST_STEP, LARGEST_STEP = 0.03, 0.25  # in the unit cube: as far as the parameter is unknown, within these
 WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's
 MOST_SIMULATED = 3  # actions that are simulated beside all values
 CLOSED = 0.05  # of the length: ends that are nearer count as together
@@ -84,7 +91,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     """
     if uncertainty.covariance is None:
         return None
-    possible = list(candidates(trials))
+    possible, known = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
 
     def simulated(candidate: Candidate, shown: NDArray[np.bool_]) -> Floats | None:
         try:
@@ -107,7 +114,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
             if matrix is None:
                 possible.remove(candidate)
                 continue
-            at_best = float((now**-2 + np.sum(matrix**2) / uncertainty.scale**2)**-0.5)  # all else known
+            # As if all else were known.
+            at_best = float((now**-2 + information(matrix, uncertainty.scale)[k, k])**-0.5)
             if at_best < WORTH_IT * now:
                 promising.append((at_best, candidate, matrix))
         best: tuple[float, Candidate] | None = None
@@ -116,7 +124,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
                 return None
             rest = simulated(candidate, ~alone)
             if rest is not None:
-                std = float(_expected(matrix + rest, uncertainty)[k])
+                std = float(standard_deviations(known + information(matrix + rest, uncertainty.scale))[k])
                 if std < WORTH_IT * now and (best is None or std < best[0]):
                     best = std, candidate
         if best is not None:
@@ -125,23 +133,6 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
             return Advice(candidate.action, candidate.words, space.free[k], now, std,
                           max(0.0, float(point[k]) - reach), min(1.0, float(point[k]) + reach))
     return None
-
-
-def expected_std(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats,
-                 uncertainty: Uncertainty, length: float) -> Floats:
-    """
-    Return the (d,) standard deviations to expect when a trial is observed, too.
-
-    :raises SimulationError: where it cannot be simulated or does not come to rest.
-    """
-    return _expected(sensitivity(trial, space, simulator, point, uncertainty.std, length), uncertainty)
-
-
-def _expected(matrix: Floats, uncertainty: Uncertainty) -> Floats:
-    """Return (d,) standard deviations with a trial of that (m, d) sensitivity."""
-    assert uncertainty.covariance is not None
-    information = np.linalg.inv(uncertainty.covariance) + matrix.T @ matrix / uncertainty.scale**2
-    return np.sqrt(np.diag(np.linalg.inv(information)))
 
 
 def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats, std: Floats,
@@ -157,20 +148,20 @@ def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point
     :raises SimulationError: where a rollout diverges, or does not come to rest.
     """
     columns: list[Floats] = []
-    for k, step in enumerate(np.clip(std, SMALLEST_STEP, LARGEST_STEP)):
+    steps = np.clip(std, STEP, WIDEST)
+    for k in range(len(point)):
         if shown is not None and not shown[k]:
             columns.append(np.zeros(3 * len(trial.goals) * len(trial.initial)))
             continue
-        chains, values = [], []
-        for sign in (-1, 1):
-            beside = point.copy()
-            beside[k] = min(max(point[k] + sign * step, 0.0), 1.0)
-            rollout = simulator.simulate(trial, space.physical(space.values(beside), length))
+        beside, chains = both_sides(point, [k], steps), []
+        for one in beside:
+            rollout = simulator.simulate(trial, space.physical(space.values(one), length))
             if at_rest and not all(rollout.settled):
                 raise SimulationError(f'trial {trial.name!r} does not come to rest')
             chains.append(rollout.chains.ravel())
-            values.append(beside[k])
-        columns.append((chains[1] - chains[0]) / (values[1] - values[0]))
+        column = slope(beside[:, k], chains)
+        assert column is not None  # both are there
+        columns.append(column)
     return np.stack(columns, axis=1)
 
 

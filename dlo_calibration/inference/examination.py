@@ -17,24 +17,26 @@ from typing import Callable, Sequence
 
 import numpy as np
 
+from dlo_calibration.evaluation.linearisation import both_sides, Linearisation, slope, STEP, WIDEST
+from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.uncertainty import (
+    at_minimum,
     DEVIATIONS,
-    from_jacobian,
     left_out,
+    noise_alone,
     optimum_shift,
     predictive_std,
     Uncertainty,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.score import distances, PointErrors
 
-STEP = 0.03  # of the central differences, in the unit cube; contacts that come and go are smaller
 SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:
-WIDE, WIDEST = 0.1, 0.25  # as far as it is unknown, within these
-WIDENINGS = 2
+WIDE = 0.1  # that far at least
+WIDENINGS = 2  # after which the steps suit what is known
 FADED = 0.9  # of the effect that the end of an interval should have: less, and the end is further away
 DOUBLINGS = 4  # of the way there; then it may be anywhere on the scale
-OUTLIER = 1.5  # standard deviations at which residuals are cut off
 ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
 MOST_FOLDS = 8  # of the cross-validation
 
@@ -71,14 +73,18 @@ class Examination:
     band: Floats
     evaluations: int
 
+    @property
+    def noise_alone(self) -> bool:
+        """Whether the residuals are noise alone."""
+        return noise_alone(self.uncertainty.residual, self.noise)
 
-def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]], evaluate: Evaluate, *,
+
+def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Evaluate | None = None,
             starts: Sequence[Evaluate] = (), thorough: bool = True) -> Examination:
     """
     Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
 
-    :param shapes: (goals, points) of each trial.
     :param default: (d,) the default parameters.
     :param noise: see `Examination`.
     :param finer: simulates with more nodes and a smaller step; None: not examined.
@@ -92,56 +98,64 @@ def examine(point: Floats, residuals: Floats, shapes: Sequence[tuple[int, int]],
         count += len(points)
         return evaluate(points)
 
-    dimension = len(point)
-    steps = np.full(dimension, STEP)
-    beside = np.concatenate([_beside(point, k, steps[k]) for k in range(dimension)] + [default[None, :]])
-    *seen, at_default = residuals_at(beside)
-    jacobian = np.stack([_column(residuals, point[k], beside[2 * k:2 * k + 2, k], seen[2 * k:2 * k + 2])
-                         for k in range(dimension)], axis=1)
-    for _ in range(WIDENINGS if thorough else 0):
-        std = from_jacobian(point, residuals, jacobian, shapes, noise=noise).std
-        wider = np.where(std > SUSPECT, np.clip(std, WIDE, WIDEST), steps)
-        weak = np.flatnonzero(wider > 1.5 * steps)
-        if not len(weak):
-            break
-        steps[weak] = wider[weak]
-        beside = np.concatenate([_beside(point, k, steps[k]) for k in weak])
-        seen = list(residuals_at(beside))
-        for j, k in enumerate(weak):
-            column = _column(residuals, point[k], beside[2 * j:2 * j + 2, k], seen[2 * j:2 * j + 2])
-            # A small difference may show a kink where there is no slope: the lesser effect is believed.
-            if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
-                jacobian[:, k] = column
-    distances = _left_out_distances(point, residuals, jacobian, shapes, residuals_at)
-    cross_validated = float(np.concatenate(distances).mean()) if distances else float('nan')
+    at_default, = residuals_at(default[None, :])
+    fit = _linearised(point, residuals, layout, residuals_at, noise, WIDENINGS if thorough else 0)
+    apart = _left_out_distances(fit, layout, residuals_at)
     shift = None
     if finer is not None:  # last: a worker keeps one simulator at a time
         count += 1
         fine, = finer(point[None, :])
-        shift = np.ones(dimension) if fine is None else optimum_shift(residuals, fine, jacobian)
+        shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
     drawn = [one for start in starts for one in start(point[None, :])]
     count += len(drawn)
-    found = from_jacobian(point, residuals, jacobian, shapes, noise=noise, shift=shift,
-                          starts=[one for one in drawn if one is not None])
+    found = at_minimum(fit, layout, noise=noise, shift=shift,
+                       starts=[one for one in drawn if one is not None])
     if thorough:
-        found = _reaching(point, residuals, jacobian, found, residuals_at)
+        found = _reaching(fit, found, residuals_at)
     assert found.covariance is not None
     return Examination(
-        uncertainty=found, jacobian=frozen_array(jacobian), noise=noise,
-        regular=_arrived(residuals, jacobian, found), cross_validated=cross_validated,
-        left_out=frozen_array([float(fold.mean()) for fold in distances]),
+        uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_arrived(fit, found),
+        cross_validated=float(np.concatenate(apart).mean()) if apart else float('nan'),
+        left_out=frozen_array([float(fold.mean()) for fold in apart]),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
-        band=frozen_array(predictive_std(jacobian, found.covariance)), evaluations=count)
+        band=frozen_array(predictive_std(fit.jacobian, found.covariance)), evaluations=count)
 
 
-def _reaching(point: Floats, residuals: Floats, jacobian: Floats, found: Uncertainty,
-              residuals_at: Evaluate) -> Uncertainty:
+def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
+                noise: float, widenings: int) -> Linearisation:
+    """Return the residuals with their derivatives, by steps that are as wide as a parameter is unknown."""
+    dimension = len(point)
+
+    def columns(wanted: Sequence[int], steps: Floats) -> list[Floats]:
+        beside = both_sides(point, wanted, steps)
+        seen = residuals_at(beside)
+        found = [slope((point[k], *beside[2 * j:2 * j + 2, k]), (residuals, *seen[2 * j:2 * j + 2]))
+                 for j, k in enumerate(wanted)]
+        return [np.zeros_like(residuals) if one is None else one for one in found]
+
+    steps = np.full(dimension, STEP)
+    jacobian = np.stack(columns(range(dimension), steps), axis=1)
+    for _ in range(widenings):
+        std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
+        wider = np.where(std > SUSPECT, np.clip(std, WIDE, WIDEST), steps)
+        weak = np.flatnonzero(wider > 1.5 * steps).tolist()
+        if not weak:
+            break
+        steps[weak] = wider[weak]
+        for k, column in zip(weak, columns(weak, steps), strict=True):
+            # A small difference may show a kink where there is no slope: the lesser effect is believed.
+            if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
+                jacobian[:, k] = column
+    return Linearisation(point, residuals, jacobian)
+
+
+def _reaching(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) -> Uncertainty:
     """
     Return intervals that reach to where the residuals have really changed enough, and not less.
 
     The effect of a stiffness fades as it grows: what is a clear loss on one side may be none on the other.
     """
-    ends, limits = np.stack([found.lower, found.upper]), (0.0, 1.0)
+    point, ends, limits = fit.point, np.stack([found.lower, found.upper]), (0.0, 1.0)
     excited = np.flatnonzero(found.excited)
     needed = DEVIATIONS * found.std * FADED
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
@@ -156,8 +170,8 @@ def _reaching(point: Floats, residuals: Floats, jacobian: Floats, found: Uncerta
         for (side, k), one in zip(unsure, residuals_at(there), strict=True):
             if one is None:
                 continue
-            own = _own_part(jacobian[:, excited], int(np.searchsorted(excited, k)))
-            if abs(float(own @ (one - residuals))) < needed[k]:
+            own = fit.columns(excited).own_weights(int(np.searchsorted(excited, k)))
+            if abs(float(own @ (one - fit.residuals))) < needed[k]:
                 ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits)
                 if ends[side, k] != limits[side]:
                     still.append((side, k))
@@ -167,60 +181,20 @@ def _reaching(point: Floats, residuals: Floats, jacobian: Floats, found: Uncerta
     return replace(found, lower=frozen_array(ends[0]), upper=frozen_array(ends[1]))
 
 
-def _own_part(jacobian: Floats, k: int) -> Floats:
-    """Return (m,) weights of a change of the residuals that tell how far k moved, not the others."""
-    others = np.delete(jacobian, k, axis=1)
-    own = jacobian[:, k] - others @ np.linalg.lstsq(others, jacobian[:, k], rcond=None)[0]
-    return np.asarray(own / max(float(own @ own), 1e-300))
-
-
-def _beside(point: Floats, k: int | np.intp, step: float) -> Floats:
-    """Return the (2, d) points beside `point` in parameter k, within the cube."""
-    beside = np.tile(point, (2, 1))
-    beside[:, k] = np.clip(point[k] + np.array([-step, step]), 0.0, 1.0)
-    return beside
-
-
-def _column(residuals: Floats, value: float, values: Floats, seen: Sequence[Floats | None]) -> Floats:
-    """Return (m,) the derivative from both sides, or from the one that could be simulated."""
-    known = [(float(at), one) for at, one in zip(values, seen, strict=True)
-             if one is not None and at != value]
-    if len(known) < 2:
-        known.append((value, residuals))
-    if len(known) < 2:
-        return np.zeros_like(residuals)
-    (low, before), (high, after) = known
-    return np.asarray((after - before) / (high - low))
-
-
-def _arrived(residuals: Floats, jacobian: Floats, found: Uncertainty) -> bool:
+def _arrived(fit: Linearisation, found: Uncertainty) -> bool:
     """Tell whether the next Gauss-Newton step stays among values that the trials cannot tell apart."""
-    free = np.flatnonzero(found.excited & ~found.at_bound)
-    columns = jacobian[:, free]
-    capped = np.clip(residuals, -OUTLIER * found.residual, OUTLIER * found.residual)
-    information = columns.T @ columns + np.eye(len(free)) * found.residual**2
-    gradient = columns.T @ capped
-    return float(gradient @ np.linalg.solve(information, gradient)) <= ARRIVED * len(free) * found.scale**2
+    free = replace(fit, residuals=Huber.of(fit.residuals).clipped(fit.residuals)).columns(
+        found.excited & ~found.at_bound)
+    count = len(free.point)
+    step = free.step(np.eye(count) * found.residual**2)
+    return -float(free.gradient @ step) <= ARRIVED * count * found.scale**2
 
 
-def _left_out_distances(point: Floats, residuals: Floats, jacobian: Floats,
-                        shapes: Sequence[tuple[int, int]], residuals_at: Evaluate) -> list[Floats]:
+def _left_out_distances(fit: Linearisation, layout: ResidualLayout, residuals_at: Evaluate) -> list[Floats]:
     """Return the point errors [m] of each fold of the trials at the optimum of the others; none of one."""
-    if len(shapes) < 2:
+    if len(layout.shapes) < 2:
         return []
-    folds = _folds(shapes)
-    sizes = [sum(goals * points for goals, points in fold) for fold in folds]
-    moved = left_out(residuals, jacobian, [(size, 1) for size in sizes])
-    seen = residuals_at(np.clip(point + np.clip(moved, -WIDEST, WIDEST), 0.0, 1.0))
-    distances, at = [], 0
-    for size, one in zip(sizes, seen, strict=True):
-        if one is not None:
-            distances.append(np.linalg.norm(one[at:at + 3 * size].reshape(-1, 3), axis=1))
-        at += 3 * size
-    return distances
-
-
-def _folds(shapes: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Divide the trials, in order, into as many folds as there are, but not too many."""
-    parts = np.array_split(np.arange(len(shapes)), min(len(shapes), MOST_FOLDS))
-    return [[shapes[k] for k in part] for part in parts]
+    folds = layout.folds(MOST_FOLDS)
+    moved = left_out(fit, folds, fit.ridge)
+    seen = residuals_at(np.clip(fit.point + np.clip(moved, -WIDEST, WIDEST), 0.0, 1.0))
+    return [distances(one[rows]) for rows, one in zip(folds, seen, strict=True) if one is not None]

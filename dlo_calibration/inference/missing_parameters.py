@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Unexplained: what more of the object would explain, of what a fit leaves over."""
+"""Missing parameters: which of those that were held fixed would explain what a fit leaves over."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from typing import Callable, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.linearisation import Linearisation, perpendicular
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Simulator
 
-PARTS = 'parts'  # the name of an explanation by parts of different stiffness
-TRIED_PARTS = 4
+PARTS = 'parts'  # the name where it is parts of different stiffness that are missing
+TRIED_PARTS = 4  # so that a middle stiffer than both ends shows
 STEP = 0.15  # that a parameter is moved, in the unit cube;
 LONG_STEP = 0.5  # from where it is nothing at all
 FURTHEST = 2.0  # times that step, to which its effect is trusted to grow
@@ -26,9 +25,9 @@ WORTH_TELLING = 0.1  # of the squares that are left
 
 
 @dataclass(frozen=True)
-class Explanation:
+class MissingParameter:
     """
-    One thing that a calibration held fixed.
+    A parameter that a calibration held fixed, and that the trials ask for.
 
     :param name: of the parameter, or PARTS.
     :param share: of the sum of squares left over, that it would explain.
@@ -38,9 +37,8 @@ class Explanation:
     share: float
 
 
-def explanations(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
-                 residuals: Floats, jacobian: Floats,
-                 should_stop: Callable[[], bool] = lambda: False) -> tuple[Explanation, ...]:
+def missing_parameters(evaluator: Evaluator, fit: Linearisation,
+                       should_stop: Callable[[], bool] = lambda: False) -> tuple[MissingParameter, ...]:
     """
     Return what would explain at least a tenth of what is left, most first.
 
@@ -48,25 +46,24 @@ def explanations(trials: Sequence[Trial], space: ParameterSpace, simulator: Simu
     on the residuals that the free ones cannot have (a score test: Rao, Linear
     Statistical Inference and Its Applications, 1973, 6e.3).
 
-    :param point: (d,) what was found, in the unit cube.
-    :param residuals: (m,) [m] there.
-    :param jacobian: (m, d) [m per unit cube].
+    :param evaluator: of the calibration.
+    :param fit: the residuals around what was found.
     :raises CancelledError: when stopped.
     """
-    roots = Huber.of(residuals).roots(residuals)
-    basis, _ = np.linalg.qr(roots[:, None] * jacobian)
-    left = _without(basis, roots * residuals)
+    roots = Huber.of(fit.residuals).roots(fit.residuals)
+    weighted = fit.weighted(roots)
+    left = perpendicular(weighted.jacobian, weighted.residuals)
     found = []
-    for name, wider, moves in _candidates(space):
-        evaluator = Evaluator(trials, wider, simulator)
+    for name, wider, moves in _candidates(evaluator.space):
+        wide = Evaluator(evaluator.trials, wider, evaluator.simulator)
         columns = []
         for move in moves:
-            seen = evaluator.evaluate(0, np.concatenate([point, move]), should_stop).residuals
+            seen = wide.evaluate(0, np.concatenate([fit.point, move]), should_stop).residuals
             if seen is not None:
-                columns.append(_without(basis, roots * (seen - residuals)))
+                columns.append(perpendicular(weighted.jacobian, roots * (seen - fit.residuals)))
         share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
         if share >= WORTH_TELLING:
-            found.append(Explanation(name, share))
+            found.append(MissingParameter(name, share))
     return tuple(sorted(found, key=lambda one: -one.share))
 
 
@@ -90,12 +87,6 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
 def _is_nothing(parameter: Parameter, now: float) -> bool:
     """Tell whether a parameter means at the lower end of a logarithmic scale that there is nothing of it."""
     return parameter.neutral == 0 and not parameter.linear and now == 0
-
-
-def _without(basis: Floats, vector: Floats) -> Floats:
-    """Return (m,) what of a vector is perpendicular to (m, d) columns."""
-    rest: Floats = vector - basis @ (basis.T @ vector)
-    return rest
 
 
 def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:

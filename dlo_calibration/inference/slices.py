@@ -15,14 +15,12 @@ import numpy as np
 
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.inference.outcome import Calibrated
+from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
-from dlo_calibration.simulation.protocol import Simulator
 
-SECONDS, SHARE, MOST_SECONDS = 5.0, 0.2, 60.0  # that slices may take; what is not there by then is left out
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first
-FINEST_PLANE = 8
+FINEST_PLANE = 8  # intervals of a plane: twice as many would take four times as long
 REACH = 4.0  # standard deviations that a slice goes to each side,
 NARROWEST = 10.0  # but so far at least (0..100)
 CORRELATED = 0.5  # from which on a second pair of parameters is looked at
@@ -73,39 +71,44 @@ class Slices:
     complete: bool
 
 
-def cut(result: Calibrated, simulator: Simulator, should_stop: Callable[[], bool] = lambda: False, *,
-        seconds: float | None = None, clock: Callable[[], float] = time.monotonic) -> Slices:
+def cut(evaluator: Evaluator, best: Evaluation, std: Floats, examination: Examination | None, *,
+        seconds: float, should_stop: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic) -> Slices:
     """
-    Simulate slices around a result, the coarse ones first, until the time is up.
+    Simulate slices around what was found, the coarse ones first, until the time is up.
 
-    :param simulator: the engine of the result.
+    :param best: what was found.
+    :param std: (d,) its standard deviations in the unit cube.
+    :param examination: of it; None where there was none.
+    :param seconds: that it may take.
     :param should_stop: asked between trials; once True, what is there is returned.
-    :param seconds: that it may take; None: a fifth of what the calibration took, 5 to 60 s.
     """
-    if seconds is None:
-        seconds = min(max(SECONDS, SHARE * result.seconds), MOST_SECONDS)
     end = clock() + seconds
-    cutter = _Cutter(result, Evaluator(result.trials, result.space, simulator),
-                     lambda: should_stop() or clock() > end)
+    cutter = _Cutter(evaluator, best, std, lambda: should_stop() or clock() > end)
+    dimension = evaluator.space.dimension
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()
     try:
         for level in LEVELS:
-            lines = tuple(cutter.line(k, level) for k in range(result.space.dimension))
+            lines = tuple(cutter.line(k, level) for k in range(dimension))
             if level <= FINEST_PLANE:
-                planes = tuple(cutter.plane(pair, level) for pair in pairs(result))
+                planes = tuple(cutter.plane(pair, level) for pair in pairs(dimension, examination))
     except CancelledError:
         return Slices(lines, planes, cutter.count, False)
     return Slices(lines, planes, cutter.count, True)
 
 
-def pairs(result: Calibrated) -> list[tuple[int, int]]:
+def seconds_for(calibration: float) -> float:
+    """Return how long slices may take [s], by how long the calibration took: a fifth, 5 to 60 s."""
+    return min(max(5.0, 0.2 * calibration), 60.0)
+
+
+def pairs(dimension: int, examination: Examination | None) -> list[tuple[int, int]]:
     """Return the indices of a pair or two of parameters, those that depend on each other most."""
-    found = result.examination
-    possible = list(combinations(range(result.space.dimension), 2))
-    if found is None or found.uncertainty.correlations is None:
+    possible = list(combinations(range(dimension), 2))
+    if examination is None or examination.uncertainty.correlations is None:
         return possible[:1]
-    size, excited = np.abs(found.uncertainty.correlations), found.uncertainty.excited
+    size, excited = np.abs(examination.uncertainty.correlations), examination.uncertainty.excited
     order = sorted((pair for pair in possible if excited[pair[0]] and excited[pair[1]]),
                    key=lambda pair: -float(size[pair]))
     return order[:1] + [pair for pair in order[1:2] if size[pair] >= CORRELATED]
@@ -114,14 +117,14 @@ def pairs(result: Calibrated) -> list[tuple[int, int]]:
 class _Cutter:
     """Evaluates points of slices, each once."""
 
-    def __init__(self, result: Calibrated, evaluator: Evaluator, late: Callable[[], bool]) -> None:
+    def __init__(self, evaluator: Evaluator, best: Evaluation, std: Floats, late: Callable[[], bool]) -> None:
         self._evaluator, self._late = evaluator, late
-        self._best = result.best
-        reach = np.maximum(REACH * result.std, NARROWEST / SCALE)
+        self._best = best
+        reach = np.maximum(REACH * std, NARROWEST / SCALE)
         self._ends = [(max(0.0, value - one), min(1.0, value + one))
-                      for value, one in zip(result.best.point.tolist(), reach.tolist(), strict=True)]
+                      for value, one in zip(best.point.tolist(), reach.tolist(), strict=True)]
         self._seen: dict[tuple[float, ...], Evaluation] = {}
-        self._names = result.space.free
+        self._names = evaluator.space.free
 
     @property
     def count(self) -> int:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Gain: what one trial tells of the parameters, beside what is known without it.
+Trial information: what one trial tells about the parameters, beside what is known without it.
 
 The information of a trial is that of linear regression: J^T J / scale^2, with the
 change J of its simulated chains with the parameters and the error of the
@@ -19,9 +19,11 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from dlo_calibration.evaluation.linearisation import information, standard_deviations
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.advice import sensitivity
-from dlo_calibration.inference.outcome import Calibrated
-from dlo_calibration.inference.uncertainty import UNKNOWN_STD
+from dlo_calibration.inference.examination import Examination
+from dlo_calibration.inference.uncertainty import unknown, UNKNOWN_STD
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
@@ -30,12 +32,11 @@ from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.simulation.protocol import Simulator
 
-NEW = 0.6  # share of the standard deviation that is left, at most, where a trial tells something: a repeat of
-# a trial leaves 0.71
+NEW = 0.6  # of the standard deviation is left at most, where a trial tells something; a repeat leaves 0.71
 NOTHING = 0.95  # share of the standard deviation of what is not known at all that is left at least
-MODEL_ERROR = 1e-3  # m, of a simulation with the right parameters, until a result says better
-UNKNOWN_NOISE = 2e-3  # m, of chains with too few points to tell
-ALIKE = 4.0  # neighbouring residuals that count as one, until a result says better
+# Until a result says better, a residual's error is that of a simulation with the right parameters and that
+# of the noise [m], assumed where chains have too few points to tell; that many neighbours count as one.
+SIMULATION_ERROR, ASSUMED_NOISE, ALIKE = 1e-3, 2e-3, 4.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Knowledge:
     @property
     def std(self) -> Floats:
         """(d,) standard deviations."""
-        return np.sqrt(np.diag(np.linalg.inv(self.information)))
+        return standard_deviations(self.information)
 
     def after(self, information: Floats) -> Knowledge:
         """Return what is known with a trial of that (d, d) information, too."""
@@ -69,7 +70,7 @@ class Knowledge:
 
 
 @dataclass(frozen=True, eq=False)
-class Gain:
+class TrialInformation:
     """
     What one trial adds.
 
@@ -90,8 +91,8 @@ class Gain:
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
 
     @classmethod
-    def unknown(cls, trial: str, names: tuple[str, ...], problem: str) -> Gain:
-        """Return the gain of a trial that could not be simulated."""
+    def unknown(cls, trial: str, names: tuple[str, ...], problem: str) -> TrialInformation:
+        """Return that of a trial that could not be simulated."""
         nothing = np.full(len(names), np.nan)
         return cls(trial, names, nothing, nothing, problem)
 
@@ -126,37 +127,27 @@ class Gain:
 
 
 def knowledge(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None,
-              result: Calibrated | None = None) -> Knowledge:
+              best: Floats | None = None, examination: Examination | None = None) -> Knowledge:
     """
-    Return what is known without the trials that `result` does not have.
+    Return what is known without the trials that were not calibrated on.
 
-    With a result, its values, and its covariance where that holds.  Without one,
-    the values that the chains alone say, or the defaults.
+    That is what a calibration found, and its covariance where that holds.  Without a
+    calibration, the values that the chains alone say, or the defaults.
 
     :param table_height: [m]; None where there is no table.
-    :param result: of the same parameters; None: there is none.
+    :param best: (d,) what a calibration of the same parameters found; None: there was none.
+    :param examination: of that; None where there was no time for it.
     """
-    if result is not None and covers(result):
-        assert result.examination is not None
-        found = result.examination.uncertainty
+    if best is not None and examination is not None and examination.regular:
+        found = examination.uncertainty
         assert found.covariance is not None
-        return Knowledge(space.free, result.best.point, frozen_array(np.linalg.inv(found.covariance)),
-                         found.scale)
-    if result is not None:
-        point = result.best.point
-    else:
+        return Knowledge(space.free, best, np.asarray(np.linalg.inv(found.covariance)), found.scale)
+    if best is None:
         start = start_point(trials, space, table_height)
-        point = np.where(np.isnan(start), space.default_point(), start)
+        best = np.where(np.isnan(start), space.default_point(), start)
     rough = noise(trials)
-    residual = np.hypot(UNKNOWN_NOISE if np.isnan(rough) else rough, MODEL_ERROR)
-    return Knowledge(space.free, point, frozen_array(np.eye(space.dimension) / UNKNOWN_STD**2),
-                     float(residual * np.sqrt(ALIKE)))
-
-
-def covers(result: Calibrated) -> bool:
-    """Tell whether a result says what is known after its trials."""
-    found = result.examination
-    return found is not None and found.regular and found.uncertainty.covariance is not None
+    residual = np.hypot(ASSUMED_NOISE if np.isnan(rough) else rough, SIMULATION_ERROR)
+    return Knowledge(space.free, best, unknown(space.dimension), float(residual * np.sqrt(ALIKE)))
 
 
 def glimpse(trial: Trial) -> Trial:
@@ -179,8 +170,8 @@ def glimpse(trial: Trial) -> Trial:
     return replace(trial, goals=tuple(goals))
 
 
-def information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator: Simulator, length: float,
-                table_height: float | None) -> Floats:
+def simulated_information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator: Simulator,
+                          length: float, table_height: float | None) -> Floats:
     """
     Return the (d, d) information of one trial, simulated beside what is known.
 
@@ -193,31 +184,19 @@ def information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator
     shown = excites([trial], space, table_height)[0]
     matrix = sensitivity(glimpse(trial), space, simulator, known.point, known.std, length,
                          shown=shown, at_rest=False)
-    return np.asarray(matrix.T @ matrix / known.scale**2)
+    return information(matrix, known.scale)
 
 
-def told_by(result: Calibrated) -> Floats:
-    """
-    Return (T, d) standard deviations in the unit cube: what each trial of a result would tell alone.
-
-    :raises ValueError: for a result that was not examined.
-    """
-    found = result.examination
-    if found is None:
-        raise ValueError('the result was not examined')
-    rows, at = [], 0
-    for trial in result.trials:
-        end = at + 3 * len(trial.goals) * len(trial.initial)
-        matrix = found.jacobian[at:end]
-        alone = matrix.T @ matrix / found.uncertainty.scale**2 + np.eye(matrix.shape[1]) / UNKNOWN_STD**2
-        rows.append(np.sqrt(np.diag(np.linalg.inv(alone))))
-        at = end
-    return np.array(rows)
+def told_by(trials: Sequence[Trial], examination: Examination) -> Floats:
+    """Return (T, d) standard deviations in the unit cube that each calibrated trial alone would give."""
+    scale, prior = examination.uncertainty.scale, unknown(examination.jacobian.shape[1])
+    return np.array([standard_deviations(information(examination.jacobian[rows], scale) + prior)
+                     for rows in ResidualLayout.of(trials).rows])
 
 
-def silent(result: Calibrated) -> tuple[str, ...]:
-    """Return the names of the trials of a result that told nothing at all; none where that is not known."""
-    if not covers(result):
+def silent(trials: Sequence[Trial], examination: Examination | None) -> tuple[str, ...]:
+    """Return the names of the trials of a calibration that told nothing; none where that is not known."""
+    if examination is None or not examination.regular:
         return ()
-    return tuple(trial.name for trial, std in zip(result.trials, told_by(result), strict=True)
+    return tuple(trial.name for trial, std in zip(trials, told_by(trials, examination), strict=True)
                  if (std > NOTHING * UNKNOWN_STD).all())

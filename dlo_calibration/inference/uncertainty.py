@@ -20,30 +20,26 @@ Where it did not, as in a random search, the good evaluations lie apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats, frozen_array
 
-BEST_SHARE = 0.05  # of the evaluations count as good,
-BEST_MINIMUM = 8  # but never fewer than that many
 UNKNOWN_STD = 1 / np.sqrt(12)  # of a value anywhere in 0..1
 IDENTIFIABLE_STD = UNKNOWN_STD / 4
 WEAK_STD = UNKNOWN_STD / 2
-CONFIDENCE = 0.9  # that the truth lies in an interval
-DEVIATIONS = 1.645  # that half such an interval has, of a normal distribution
-AT_BOUND = 0.002
+DEVIATIONS = 1.645  # that half an interval of 90 % has, of a normal distribution
+AT_BOUND = 0.002  # of an end of the scale: what lies nearer may lie beyond
 MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
-DRAWS = 200  # of the bootstrap over trials
 FEWEST_TRIALS = 3  # whose disagreement says something
-SMALLEST_RESIDUAL = 1e-9  # m; of a model that explains everything
 REMAINING = 2.0  # times the change by a simulation twice as fine is missing: the error is of first order
 INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
-ROBUST = 1.5  # deviations beyond which a residual counts less (Huber, Robust Statistics, 1981, 4.5)
-CAPPED = 0.7785  # mean square of a standard normal value that is cut off there
 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
 
@@ -113,7 +109,7 @@ class Uncertainty:
 
 def good_count(evaluations: int) -> int:
     """Return how many of that many evaluations count as good: the best 5 %, 8 at least."""
-    return max(BEST_MINIMUM, round(BEST_SHARE * evaluations))
+    return max(8, round(0.05 * evaluations))
 
 
 def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
@@ -138,43 +134,46 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     return Uncertainty(std, points.min(axis=0), points.max(axis=0), everywhere, ~everywhere)
 
 
-def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], *,
-                  noise: float = float('nan'), shift: Floats | None = None,
-                  starts: Sequence[Floats] = ()) -> Uncertainty:
+def unknown(dimension: int) -> Floats:
+    """Return the (d, d) information on d parameters that may have any value of their scale."""
+    return np.asarray(np.eye(dimension) / UNKNOWN_STD**2)
+
+
+def noise_alone(residual: float, noise: float) -> bool:
+    """Tell whether residuals are noise alone, by their standard deviation and the noise's [m]; nan: no."""
+    return residual < MODEL_ERROR * noise
+
+
+def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = float('nan'),
+               shift: Floats | None = None, starts: Sequence[Floats] = ()) -> Uncertainty:
     """
     Return what the residuals and their derivatives at a minimum say.
 
-    :param point: (d,) in the unit cube.
-    :param residuals: (m,) [m], trial by trial, goal by goal, point by point, coordinate by coordinate.
-    :param jacobian: (m, d) [m per unit cube].
-    :param shapes: (goals, points) of each trial.
     :param noise: standard deviation of one coordinate of the observations [m]; nan where not known.
     :param shift: (d,) how far a finer simulation moves the optimum; None: not known.
     :param starts: (m,) [m] each, residuals there with other draws of the noise of the initial chains; may be
         none.
     """
-    weights = _weights(residuals, residuals)
-    right, matrix = weights * residuals, weights[:, None] * jacobian
-    capped = weights**2 * residuals
-    residual = float(np.sqrt(capped @ capped / CAPPED / max(1, len(residuals) - len(point))))
-    residual = max(residual, SMALLEST_RESIDUAL)
-    scale = residual * float(np.sqrt(independence(capped, shapes)))
-    prior = np.eye(len(point)) * (scale / UNKNOWN_STD)**2
-    information = matrix.T @ matrix
+    point, loss = fit.point, Huber.of(fit.residuals)
+    clipped = loss.clipped(fit.residuals)
+    residual = loss.deviation(fit.residuals, len(point))
+    scale = residual * float(np.sqrt(independence(clipped, layout)))
+    weighted = fit.weighted(loss.roots(fit.residuals) / scale)
+    prior = unknown(len(point))
     with np.errstate(divide='ignore'):
-        excited = scale / np.sqrt(np.diag(information)) < UNKNOWN_STD
-    covariance = scale**2 * np.linalg.inv(information + prior)
+        excited = 1 / np.sqrt(np.diag(weighted.information)) < UNKNOWN_STD
+    covariance = np.linalg.inv(weighted.information + prior)
     extra = np.zeros(len(point))
-    if len(shapes) >= FEWEST_TRIALS and not residual < MODEL_ERROR * noise:
+    if len(layout.shapes) >= FEWEST_TRIALS and not noise_alone(residual, noise):
         disagreement = np.maximum(
-            np.var(left_out(right, matrix, shapes, prior), axis=0) * (len(shapes) - 1),
-            np.var(drawn_again(right, matrix, shapes, prior), axis=0))
+            np.var(left_out(weighted, layout.rows, prior), axis=0) * (len(layout.shapes) - 1),
+            np.var(drawn_again(weighted, layout.rows, prior), axis=0))
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (REMAINING * shift)**2
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
-        pulls = [jacobian[rows].T @ (_weights(one, residuals)**2 * one - capped)[rows]
-                 for one in starts for rows in _rows(shapes)]
+        pulls = [fit.jacobian[rows].T @ (loss.clipped(one) - clipped)[rows]
+                 for one in starts for rows in layout.rows]
         moves = covariance @ np.array(pulls).T / scale**2
         covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0) / len(starts)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
@@ -189,53 +188,44 @@ def from_jacobian(point: Floats, residuals: Floats, jacobian: Floats, shapes: Se
                        frozen_array(covariance), residual, scale)
 
 
-def left_out(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]],
-             prior: Floats | None = None) -> Floats:
+def left_out(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Floats:
     """
-    Return (T, d): how far the optimum moves when one trial after the other is left out.
+    Return (T, d): how far the optimum moves when one group of residuals after the other is left out.
 
     One Gauss-Newton step from the common optimum (the jackknife of Efron and
     Tibshirani, An Introduction to the Bootstrap, 1993, 11, linearised).
 
-    :param prior: (d, d) added to the information matrix [m^2 per unit cube squared]; None: a trace of it.
+    :param groups: the rows of T trials or folds.
+    :param prior: (d, d) added to the information.
     """
-    information = jacobian.T @ jacobian
-    if prior is None:
-        prior = np.eye(len(information)) * max(1e-9 * float(np.trace(information)), 1e-30)
-    gradient = jacobian.T @ residuals
+    information, gradient = fit.information, fit.gradient
     moved = []
-    for rows in _rows(shapes):
-        rest = information - jacobian[rows].T @ jacobian[rows] + prior
-        moved.append(-np.linalg.solve(rest, gradient - jacobian[rows].T @ residuals[rows]))
+    for part in (fit.rows(rows) for rows in groups):
+        rest = information - part.information + prior
+        moved.append(-np.linalg.solve(rest, gradient - part.gradient))
     return np.array(moved)
 
 
-def drawn_again(residuals: Floats, jacobian: Floats, shapes: Sequence[tuple[int, int]], prior: Floats,
-                draws: int = DRAWS) -> Floats:
+def drawn_again(fit: Linearisation, groups: Sequence[slice], prior: Floats, draws: int = 200) -> Floats:
     """
     Return (draws, d): how far the optimum moves where as many of the T trials are drawn, with replacement.
 
     The bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 6), each by one
     Gauss-Newton step from the common optimum; the same draws each time.
 
-    :param prior: (d, d) added to the information matrix [m^2 per unit cube squared].
+    :param groups: the rows of T trials.
+    :param prior: (d, d) added to the information.
     """
-    rows = _rows(shapes)
-    informations = np.array([jacobian[one].T @ jacobian[one] for one in rows])
-    gradients = np.array([jacobian[one].T @ residuals[one] for one in rows])
-    counts = np.random.default_rng(0).multinomial(len(rows), np.full(len(rows), 1 / len(rows)), size=draws)
+    parts = [fit.rows(rows) for rows in groups]
+    informations = np.array([part.information for part in parts])
+    gradients = np.array([part.gradient for part in parts])
+    counts = np.random.default_rng(0).multinomial(len(parts), np.full(len(parts), 1 / len(parts)), size=draws)
     matrices = np.tensordot(counts, informations, axes=1) + prior
     moved: Floats = -np.linalg.solve(matrices, (counts @ gradients)[..., None])[..., 0]
     return moved
 
 
-def _rows(shapes: Sequence[tuple[int, int]]) -> list[slice]:
-    """Return where each trial's residuals are."""
-    ends = np.cumsum([0, *(3 * goals * points for goals, points in shapes)])
-    return [slice(int(begin), int(end)) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
-
-
-def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
+def independence(residuals: Floats, layout: ResidualLayout) -> float:
     """
     Return how many residuals count as one, >= 1: neighbours along the DLO and in time err alike.
 
@@ -243,8 +233,7 @@ def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
     Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial,
     each summed up to the first that white noise could show.
     """
-    blocks = [residuals[rows].reshape(goals, points, 3)
-              for rows, (goals, points) in zip(_rows(shapes), shapes, strict=True)]
+    blocks = layout.chains(residuals)
     power = float(np.mean([np.square(block).mean() for block in blocks]))
     lengths = []
     for axis in (1, 0):
@@ -261,25 +250,16 @@ def independence(residuals: Floats, shapes: Sequence[tuple[int, int]]) -> float:
     return lengths[0] * lengths[1]
 
 
-def optimum_shift(residuals: Floats, finer: Floats, jacobian: Floats) -> Floats:
+def optimum_shift(fit: Linearisation, finer: Floats) -> Floats:
     """
     Return (d,): how far the optimum moves where a finer simulation gives residuals `finer`, (m,) [m].
 
     A Gauss-Newton step on the difference, each parameter no further than its whole scale.
     """
-    information = jacobian.T @ jacobian
-    trace = np.eye(len(information)) * max(1e-6 * float(np.trace(information)), 1e-30)
-    return np.clip(-np.linalg.solve(information + trace, jacobian.T @ (finer - residuals)), -1.0, 1.0)
+    return np.clip(replace(fit, residuals=finer - fit.residuals).step(fit.ridge), -1.0, 1.0)
 
 
 def predictive_std(jacobian: Floats, covariance: Floats) -> Floats:
     """Return (p,) [m]: how far each of p simulated points may lie elsewhere, given the covariance (d, d)."""
     variances = np.einsum('mi,ij,mj->m', jacobian, covariance, jacobian)
     return np.asarray(np.sqrt(variances.reshape(-1, 3).sum(axis=1)))
-
-
-def _weights(residuals: Floats, usual: Floats) -> Floats:
-    """Return (m,) square roots of Huber's weights: what is an outlier among `usual` residuals counts less."""
-    scale = 1.4826 * float(np.median(np.abs(usual)))
-    sizes = np.abs(residuals) / (ROBUST * scale) if scale > 0 else np.zeros_like(residuals)
-    return 1 / np.sqrt(np.maximum(sizes, 1.0))

@@ -110,6 +110,11 @@ def residuals(trial: Trial, chains: Floats) -> Floats:
                            for goal, chain in zip(trial.goals, chains, strict=True)])
 
 
+def distances(residual: Floats) -> Floats:
+    """Return (p,) [m] how far each simulated point is from the observed one, of residuals (3 p,) [m]."""
+    return np.asarray(np.linalg.norm(residual.reshape(-1, 3), axis=1))
+
+
 @dataclass(frozen=True)
 class PointErrors:
     """
@@ -129,6 +134,6 @@ class PointErrors:
     @classmethod
     def of(cls, residual: Floats) -> PointErrors:
         """Return the errors of a residual vector, (3 p,) [m] of p points."""
-        distances = np.linalg.norm(residual.reshape(-1, 3), axis=1)
-        return cls(mean=float(distances.mean()), rms=float(np.sqrt(np.mean(distances**2))),
-                   max=float(distances.max()), mean_abs=float(np.abs(residual).mean()))
+        sizes = distances(residual)
+        return cls(mean=float(sizes.mean()), rms=float(np.sqrt(np.mean(sizes**2))),
+                   max=float(sizes.max()), mean_abs=float(np.abs(residual).mean()))

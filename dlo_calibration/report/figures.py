@@ -11,6 +11,7 @@ from typing import Iterator
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.slices import Line, Plane, Slices
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.chain import Floats
@@ -228,11 +229,8 @@ def _residuals(result: CalibrationResult, k: int) -> Floats:
 def _band(result: CalibrationResult, k: int) -> Floats:
     """Return (n,) [mm] how far each point of a trial may lie elsewhere, the most of the goals shown."""
     assert result.examination is not None
-    trial = result.trials[k]
-    sizes = [len(one.goals) * len(one.initial) for one in result.trials]
-    start = sum(sizes[:k])
-    band = result.examination.band[start:start + sizes[k]].reshape(len(trial.goals), -1)
-    return np.asarray(band[shown_goals(len(trial.goals))].max(axis=0) * MILLIMETRES)
+    band = ResidualLayout.of(result.trials).by_point(result.examination.band)[k]
+    return np.asarray(band[shown_goals(len(result.trials[k].goals))].max(axis=0) * MILLIMETRES)
 
 
 def _line(result: CalibrationResult, line: Line) -> Chart:

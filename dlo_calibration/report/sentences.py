@@ -70,7 +70,7 @@ def values(result: CalibrationResult) -> dict[str, Any]:
         'noise_m': None if found is None else found.noise,
         'residual_std_m': None if found is None else found.uncertainty.residual,
         'correlations': correlations, 'undetermined': list(result.undetermined), 'advice': advice,
-        'explanations': {one.name: one.share for one in result.explanations}}
+        'explanations': {one.name: one.share for one in result.missing_parameters}}
 
 
 def _known(result: CalibrationResult) -> list[str]:
@@ -107,7 +107,7 @@ def _open(result: CalibrationResult) -> list[str]:
 
 
 def _silent(result: CalibrationResult) -> list[str]:
-    names = silent(result) if len(result.trials) > 1 else ()
+    names = silent(result.trials, result.examination) if len(result.trials) > 1 else ()
     return [f'{", ".join(names)} told nothing: all of it would have been known without.'] if names else []
 
 
@@ -142,10 +142,10 @@ def _fit(result: CalibrationResult) -> list[str]:
 
 def _unexplained(result: CalibrationResult) -> list[str]:
     """Say what to calibrate, too."""
-    shares = [f'{one.name} {100 * one.share:.0f} %' for one in result.explanations]
+    shares = [f'{one.name} {100 * one.share:.0f} %' for one in result.missing_parameters]
     if not shares:
         return []
-    names = [one.name for one in result.explanations if one.name != PARTS]
+    names = [one.name for one in result.missing_parameters if one.name != PARTS]
     how = [f'add {" or ".join(names)} to calibrate'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
     return [f'Of the squares of what is left over, these would explain about: {", ".join(shares)}. '

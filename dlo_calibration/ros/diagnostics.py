@@ -11,7 +11,7 @@ from typing import Any, Mapping, Sequence
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.confirmation import Confirmation
-from dlo_calibration.inference.trial_information import Gain
+from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.parameters import measured
 from dlo_calibration.report import sentences
@@ -120,7 +120,7 @@ def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
 
 
 def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '', gain: Gain | None = None) -> Any:
+           incomplete: str = '', detail: str = '', gain: TrialInformation | None = None) -> Any:
     """
     Build the message about what the node is doing.
 

@@ -24,7 +24,7 @@ from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DloCalibrationError, InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
-from dlo_calibration.inference.trial_information import Gain
+from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import KEPT, TrialCollector
 from dlo_calibration.ros import diagnostics
@@ -124,7 +124,7 @@ class _Memory:
     started: bool = False
     status: dict[str, Any] = field(default_factory=dict)
     result: CalibrationResult | None = None
-    gain: Gain | None = None
+    gain: TrialInformation | None = None
     markers: _Pace = field(default_factory=_Pace)
     appraisal: _Pace = field(default_factory=_Pace)
 

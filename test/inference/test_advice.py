@@ -14,7 +14,7 @@ from dlo_calibration import Chain, Goal, SimulationError, Trial
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import advised
-from dlo_calibration.inference.advice import advise, candidates, expected_std
+from dlo_calibration.inference.advice import advise, candidates
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import SEARCHES
@@ -161,14 +161,6 @@ def test_a_result_that_is_no_minimum_gets_no_advice():
     assert advised(setting, result).advice is not None
     for examination in (None, replace(result.examination, regular=False)):
         assert advised(setting, replace(result, examination=examination)).advice is None
-
-
-def test_what_is_expected_of_no_information_is_what_is_known():
-    simulator = Telling('drag')
-    result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
-    lift = next(one for one in candidates(result.trials) if one.action == 'lift_and_hold')
-    std = expected_std(lift.trial, SPACE, simulator, result.best.point, result.examination.uncertainty, 1.0)
-    assert std[1] == pytest.approx(np.sqrt(result.examination.uncertainty.covariance[1, 1]), rel=1e-6)
 
 
 ALONG = np.linspace(0, 1, 11)

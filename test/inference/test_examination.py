@@ -6,12 +6,13 @@
 import numpy as np
 import pytest
 
-from dlo_calibration.inference.examination import examine, STEP, WIDEST
+from dlo_calibration.evaluation.linearisation import STEP, WIDEST
+from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.inference.examination import examine
 from dlo_calibration.model.score import PointErrors
 
-SHAPES = ((1, 20), (2, 20), (1, 20))
-ROWS = 3 * sum(goals * points for goals, points in SHAPES)
-ENDS = np.cumsum([0, *(3 * goals * points for goals, points in SHAPES)])
+LAYOUT = ResidualLayout(((1, 20), (2, 20), (1, 20)))
+ROWS = LAYOUT.rows[-1].stop
 TRUTH = np.array([0.4, 0.6])
 DEFAULT = np.array([0.5, 0.7])
 NOISE = 1e-3
@@ -51,7 +52,7 @@ def optimum(model, rows=slice(None)):
 
 def examined(model, point=None, **rest):
     point = optimum(model) if point is None else point
-    return examine(point, model.at(point), SHAPES, model, default=DEFAULT, noise=NOISE, **rest)
+    return examine(point, model.at(point), LAYOUT, model, default=DEFAULT, noise=NOISE, **rest)
 
 
 def test_the_jacobian_of_a_linear_model_is_recovered():
@@ -90,9 +91,9 @@ def test_no_point_leaves_the_unit_cube():
 def test_cross_validation_is_the_error_of_refits_without_each_trial():
     model = noisy_model()
     distances = []
-    for first, last in zip(ENDS[:-1], ENDS[1:], strict=True):
-        others = np.r_[0:first, last:ROWS]
-        left = model.at(optimum(model, others))[first:last]
+    for rows in LAYOUT.rows:
+        others = np.delete(np.arange(ROWS), rows)
+        left = model.at(optimum(model, others))[rows]
         distances.append(np.linalg.norm(left.reshape(-1, 3), axis=1))
     found = examined(model)
     assert found.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=1e-6)
@@ -102,7 +103,8 @@ def test_cross_validation_is_the_error_of_refits_without_each_trial():
 def test_one_trial_cannot_be_cross_validated():
     model = noisy_model()
     point = optimum(model)
-    found = examine(point, model.at(point), [(1, ROWS // 3)], model, default=DEFAULT, noise=NOISE)
+    found = examine(point, model.at(point), ResidualLayout(((1, ROWS // 3),)), model,
+                    default=DEFAULT, noise=NOISE)
     assert np.isnan(found.cross_validated)
 
 
@@ -222,7 +224,7 @@ def test_a_stop_in_the_middle_is_passed_on():
 
     model = noisy_model()
     with pytest.raises(Stopped):
-        examine(TRUTH, model.at(TRUTH), SHAPES, stopping, default=DEFAULT, noise=NOISE)
+        examine(TRUTH, model.at(TRUTH), LAYOUT, stopping, default=DEFAULT, noise=NOISE)
 
 
 def test_the_band_says_how_far_points_may_lie_elsewhere():

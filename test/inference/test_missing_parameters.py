@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Unexplained: what was held fixed, and would have explained the rest."""
+"""Missing parameters: what was held fixed, and would have explained the rest."""
 
 from dataclasses import replace
 
@@ -28,22 +28,22 @@ def found(trials, space=EVEN):
 @pytest.mark.parametrize('name, value', [('natural_curvature', 15.0), ('length_scale', 70.0)])
 def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
-    assert result.explanations[0].name == name
-    assert result.explanations[0].share > 0.15
+    assert result.missing_parameters[0].name == name
+    assert result.missing_parameters[0].share > 0.15
     assert f'add {name}' in sentences(result)[-1]
-    assert values(result)['explanations'][name] == result.explanations[0].share
+    assert values(result)['explanations'][name] == result.missing_parameters[0].share
 
 
 def test_it_names_parts_of_different_stiffness():
     result = found(observed(EVEN.divided(4), STIFF_MIDDLE))
-    assert result.explanations[0].name == PARTS
-    assert result.explanations[0].share > 0.15
+    assert result.missing_parameters[0].name == PARTS
+    assert result.missing_parameters[0].share > 0.15
     assert 'set parts to 0' in sentences(result)[-1]
 
 
 def test_where_only_noise_is_left_there_is_nothing_to_explain():
     result = found(observed(EVEN, TRUTH))
-    assert result.explanations == ()
+    assert result.missing_parameters == ()
     assert values(result)['explanations'] == {}
 
 
@@ -54,7 +54,7 @@ def test_nothing_is_named_that_would_not_help():
         for k, goal in enumerate(trial.goals))) for trial in observed(EVEN, TRUTH)]
     result = found(trials)
     assert result.examination.uncertainty.residual > 5e-3
-    assert result.explanations == ()
+    assert result.missing_parameters == ()
 
 
 def test_a_stop_leaves_the_result_as_it_is():

@@ -13,7 +13,8 @@ from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs
+from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs, seconds_for
 
 
 @pytest.fixture(scope='module')
@@ -24,8 +25,14 @@ def result():
     return found
 
 
+def around(result, simulator=None, seconds=60.0, **rest):
+    """Return slices around a result."""
+    evaluator = Evaluator(result.trials, result.space, simulator or ToySimulator())
+    return cut(evaluator, result.best, result.std, result.examination, seconds=seconds, **rest)
+
+
 def test_a_line_per_parameter_whose_lowest_error_is_at_the_truth(result):
-    slices = cut(result, ToySimulator())
+    slices = around(result)
     assert [line.name for line in slices.lines] == list(result.space.free)
     for line in slices.lines:
         assert len(line.values) in (LEVELS[-1] + 1, LEVELS[-1] + 2)
@@ -37,7 +44,7 @@ def test_a_line_per_parameter_whose_lowest_error_is_at_the_truth(result):
 
 
 def test_errors_are_those_of_the_simulator(result):
-    line = cut(result, ToySimulator()).lines[0]
+    line = around(result).lines[0]
     # The toy lifts the chain by a sine arch of 0.2 m for the whole scale.
     arch = 0.2 * np.sin(np.linspace(0, np.pi, len(result.trials[0].initial)))
     expected = abs(line.values - TRUTH['flexibility']) / 100 * np.sqrt(np.mean(arch**2))
@@ -45,7 +52,7 @@ def test_errors_are_those_of_the_simulator(result):
 
 
 def test_plane_has_the_first_parameter_along_the_first_axis(result):
-    slices = cut(result, ToySimulator())
+    slices = around(result)
     plane = slices.planes[0]
     lines = {line.name: line for line in slices.lines}
     k = int(np.abs(plane.values[1] - result.values[plane.names[1]]).argmin())
@@ -62,34 +69,34 @@ def test_pair_that_depends_on_each_other_most_comes_first(result):
     examination = replace(result.examination, uncertainty=replace(
         result.examination.uncertainty, covariance=covariance, excited=np.ones(4, dtype=bool)))
     expected = [(names.index('elasticity'), names.index('friction'))]
-    assert pairs(replace(result, examination=examination)) == expected
+    assert pairs(4, examination) == expected
 
 
 def test_what_takes_too_long_is_left_out(result):
     now = iter(np.arange(10000.0))
-    slices = cut(result, ToySimulator(), seconds=60, clock=lambda: next(now))
+    slices = around(result, seconds=60, clock=lambda: next(now))
     assert not slices.complete
     assert slices.evaluations < 60
     assert all(len(line.values) <= LEVELS[0] + 2 for line in slices.lines)
-    nothing = cut(result, ToySimulator(), should_stop=lambda: True)
+    nothing = around(result, should_stop=lambda: True)
     assert (nothing.lines, nothing.planes, nothing.evaluations, nothing.complete) == ((), (), 0, False)
 
 
 @pytest.mark.parametrize('seconds, most', [(1.0, 5), (100.0, 20), (1e4, 60)])
 def test_takes_a_fifth_of_the_time_of_the_calibration_within_bounds(result, seconds, most):
     now = iter(np.arange(10000.0))
-    slices = cut(replace(result, seconds=seconds), ToySimulator(), clock=lambda: next(now))
+    slices = around(result, seconds=seconds_for(seconds), clock=lambda: next(now))
     assert 0 < slices.evaluations <= most
 
 
 def test_failures_are_infinite(result):
-    slices = cut(result, ToySimulator(fail_below=result.values['flexibility'] - 1.0))
+    slices = around(result, ToySimulator(fail_below=result.values['flexibility'] - 1.0))
     line = slices.lines[0]
     assert math.isinf(line.errors[0]) and math.isinf(line.scores[0])
     assert np.isfinite(line.errors[-1])
 
 
 def test_is_the_same_each_time(result):
-    one, two = (cut(result, ToySimulator()) for _ in range(2))
+    one, two = (around(result) for _ in range(2))
     assert all(np.array_equal(a.errors, b.errors) for a, b in zip(one.lines, two.lines, strict=True))
     assert one.evaluations == two.evaluations

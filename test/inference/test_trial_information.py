@@ -12,13 +12,12 @@ from toy_simulator import REACH, toy_trial, ToySimulator
 
 from dlo_calibration import Chain, Goal, Hand, SimulationError
 from dlo_calibration.inference.trial_information import (
-    covers,
-    Gain,
     glimpse,
-    information,
     knowledge,
     silent,
+    simulated_information,
     told_by,
+    TrialInformation,
 )
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.parameters import ParameterSpace
@@ -48,8 +47,8 @@ def gains(trials, simulator):
     """Return what each trial adds to those before."""
     known, found = knowledge(trials, SPACE, 0.0), []
     for trial in trials:
-        after = known.after(information(trial, known, SPACE, simulator, 1.0, 0.0))
-        found.append(Gain(trial.name, known.names, known.std, after.std))
+        after = known.after(simulated_information(trial, known, SPACE, simulator, 1.0, 0.0))
+        found.append(TrialInformation(trial.name, known.names, known.std, after.std))
         known = after
     return found
 
@@ -62,7 +61,7 @@ def test_before_any_trial_nothing_is_known():
 
 def test_the_standard_deviation_after_a_trial_is_that_of_linear_regression():
     known = knowledge([FIRST], SPACE, 0.0)
-    after = known.after(information(FIRST, known, SPACE, ToySimulator(), 1.0, 0.0))
+    after = known.after(simulated_information(FIRST, known, SPACE, ToySimulator(), 1.0, 0.0))
     assert after.std == pytest.approx((12 + SQUARES / known.scale**2)**-0.5, rel=1e-6)
 
 
@@ -95,7 +94,7 @@ def test_what_a_trial_surely_does_not_show_is_not_simulated():
     simulate = simulator.simulate
     simulator.simulate = lambda trial, physical: simulated.append(physical) or simulate(trial, physical)
     known = knowledge([FIRST], space, 0.0)
-    after = known.after(information(FIRST, known, space, simulator, 1.0, 0.0))
+    after = known.after(simulated_information(FIRST, known, space, simulator, 1.0, 0.0))
     assert len(simulated) == 2  # either side in flexibility; damping does not show at rest
     assert after.std[1] == pytest.approx(UNKNOWN_STD)
 
@@ -110,15 +109,16 @@ class Restless(ToySimulator):
 
 def test_a_trial_that_does_not_come_to_rest_tells_what_it_tells():
     known = knowledge([FIRST], SPACE, 0.0)
-    one, other = (information(FIRST, known, SPACE, toy, 1.0, 0.0) for toy in (Restless(), ToySimulator()))
+    one, other = (simulated_information(FIRST, known, SPACE, toy, 1.0, 0.0)
+                  for toy in (Restless(), ToySimulator()))
     assert one.tolist() == other.tolist()
 
 
 def test_a_trial_that_cannot_be_simulated_says_so():
     known = knowledge([FIRST], SPACE, 0.0)
     with pytest.raises(SimulationError, match='diverged'):
-        information(FIRST, known, SPACE, ToySimulator(fail_below=101.0), 1.0, 0.0)
-    gain = Gain.unknown('trial 3', SPACE.free, 'it diverged')
+        simulated_information(FIRST, known, SPACE, ToySimulator(fail_below=101.0), 1.0, 0.0)
+    gain = TrialInformation.unknown('trial 3', SPACE.free, 'it diverged')
     assert gain.words == 'what trial 3 tells is not known: it diverged'
     assert gain.values == {}
     assert gain.told == ()
@@ -134,7 +134,8 @@ def stream(count):
 
 def test_a_tracker_that_goes_on_at_rest_changes_nothing():
     known = knowledge([FIRST], SPACE, 0.0)
-    short, long = (information(stream(count), known, SPACE, ToySimulator(), 1.0, 0.0) for count in (1, 100))
+    short, long = (simulated_information(stream(count), known, SPACE, ToySimulator(), 1.0, 0.0)
+                   for count in (1, 100))
     assert short.tolist() == long.tolist()
     assert [goal.stable for goal in glimpse(stream(100)).goals] == [False] * 5 + [True]
 
@@ -162,22 +163,22 @@ def calibrated(simulator, *names):
 def test_after_a_result_the_next_trial_adds_to_what_it_found():
     # Four: what is known counts the noise of their initial chains, too, which the toy does not smooth.
     result = calibrated(ToySimulator(), 'trial 1', 'trial 2', 'trial 3', 'trial 4')
-    assert covers(result)
-    known = knowledge(result.trials, SPACE, 0.0, result)
+    assert result.examination.regular
+    known = knowledge(result.trials, SPACE, 0.0, result.best.point, result.examination)
     assert known.point.tolist() == result.best.point.tolist()
     assert known.std == pytest.approx(result.examination.uncertainty.std, rel=1e-6)
-    again = Gain('trial 5', known.names, known.std, known.after(information(
+    again = TrialInformation('trial 5', known.names, known.std, known.after(simulated_information(
         FIRST, known, SPACE, ToySimulator(), 1.0, 0.0)).std)
     assert again.told == ()
 
 
 def test_a_result_says_what_each_trial_told_alone():
     result = calibrated(Blind(), 'trial 1', 'trial 2')
-    alone = told_by(result)
+    alone = told_by(result.trials, result.examination)
     assert alone.shape == (2, 2)
     assert alone[0, 1] == pytest.approx(UNKNOWN_STD)
     assert (alone[[0, 1, 1], [0, 0, 1]] < 0.1).all()
-    assert silent(result) == ()
+    assert silent(result.trials, result.examination) == ()
 
 
 def test_a_trial_that_told_nothing_is_named():
@@ -188,5 +189,5 @@ def test_a_trial_that_told_nothing_is_named():
             return super().simulate(trial, physical)
 
     result = calibrated(Deaf(), 'trial 1', 'idle', 'trial 3')
-    assert silent(result) == ('idle',)
-    assert silent(replace(result, examination=None)) == ()
+    assert silent(result.trials, result.examination) == ('idle',)
+    assert silent(result.trials, None) == ()

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.uncertainty import (
+    at_minimum,
     drawn_again,
-    from_jacobian,
     independence,
     left_out,
     optimum_shift,
@@ -81,6 +83,7 @@ def test_failed_evaluations_count_as_bad_ones():
 
 SHAPES = ((1, 40), (2, 20), (1, 40), (1, 40))
 ROWS = 3 * sum(goals * points for goals, points in SHAPES)
+LAYOUT = ResidualLayout(SHAPES)
 POINT = np.array([0.4, 0.6, 0.5])
 
 
@@ -107,7 +110,7 @@ def coverage(errors_of, draws=300, **known):
     inside = []
     for draw in range(draws):
         moved, residuals = fitted(jacobian, errors_of(np.random.default_rng(draw)))
-        found = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, **known)
+        found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, **known)
         inside.append((found.lower <= POINT) & (POINT <= found.upper))
     return np.mean(inside, axis=0)
 
@@ -134,13 +137,13 @@ def test_errors_that_are_alike_at_neighbours_widen_the_intervals():
 
 def test_where_the_model_is_wrong_the_disagreement_of_the_trials_counts():
     jacobian = linear_model()
-    at = np.cumsum([0, *(3 * goals * points for goals, points in SHAPES)])
     errors = np.random.default_rng(1).normal(0, 1e-3, ROWS)
-    for k, away in enumerate((0.1, -0.1, 0.1, -0.1)):  # each trial sees another optimum
-        errors[at[k]:at[k + 1]] -= jacobian[at[k]:at[k + 1], 0] * away
+    # Each trial sees another optimum.
+    for rows, away in zip(LAYOUT.rows, (0.1, -0.1, 0.1, -0.1), strict=True):
+        errors[rows] -= jacobian[rows, 0] * away
     moved, residuals = fitted(jacobian, errors)
-    noise_alone = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, noise=1.0)
-    found = from_jacobian(POINT + moved, residuals, jacobian, SHAPES, noise=1e-3)
+    noise_alone = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1.0)
+    found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), LAYOUT, noise=1e-3)
     assert found.std[0] > 1.5 * noise_alone.std[0]
     assert found.std[0] > 0.03
 
@@ -149,9 +152,10 @@ def test_leaving_a_trial_out_moves_the_optimum_as_a_new_fit_would():
     jacobian = linear_model()
     errors = np.random.default_rng(2).normal(0, 1e-3, ROWS)
     moved, residuals = fitted(jacobian, errors)
-    at = 3 * SHAPES[0][0] * SHAPES[0][1]
+    at = LAYOUT.rows[0].stop
     again, _ = fitted(jacobian[at:], errors[at:])
-    assert left_out(residuals, jacobian, SHAPES)[0] == pytest.approx(again - moved, abs=1e-6)
+    fit = Linearisation(POINT, residuals, jacobian)
+    assert left_out(fit, LAYOUT.rows, fit.ridge)[0] == pytest.approx(again - moved, abs=1e-6)
 
 
 def test_trials_drawn_again_scatter_as_their_mean_does():
@@ -160,7 +164,8 @@ def test_trials_drawn_again_scatter_as_their_mean_does():
     values = np.random.default_rng(6).normal(0, 0.02, count)
     values -= values.mean()
     jacobian = np.ones((30 * count, 1))
-    moved = drawn_again(np.repeat(-values, 30), jacobian, [(2, 5)] * count, np.zeros((1, 1)), draws=4000)
+    fit = Linearisation(np.zeros(1), np.repeat(-values, 30), jacobian)
+    moved = drawn_again(fit, ResidualLayout(((2, 5),) * count).rows, np.zeros((1, 1)), draws=4000)
     assert moved.shape == (4000, 1)
     assert moved.std() == pytest.approx(values.std() / np.sqrt(count), rel=0.05)
     assert moved.mean() == pytest.approx(0, abs=3e-4)
@@ -170,7 +175,7 @@ def test_a_parameter_without_effect_is_not_excited_and_can_be_anything():
     jacobian = linear_model()
     jacobian[:, 1] = 0.0
     residuals = np.random.default_rng(3).normal(0, 1e-3, ROWS)
-    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3)
+    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
     assert found.excited.tolist() == [True, False, True]
     assert found.verdicts == ('identifiable', 'not identifiable', 'identifiable')
     assert (found.lower[1], found.upper[1]) == (0, 1)
@@ -180,7 +185,7 @@ def test_two_parameters_that_only_show_together_are_named_as_a_combination():
     jacobian = linear_model()
     jacobian[:, 1] = jacobian[:, 0] * (1 + 1e-3 * np.linspace(-1, 1, ROWS))
     residuals = np.random.default_rng(4).normal(0, 1e-3, ROWS)
-    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3)
+    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3)
     assert found.verdicts == ('not identifiable', 'not identifiable', 'identifiable')
     assert found.correlations[0, 1] < -0.95
     combination, = found.undetermined
@@ -190,7 +195,8 @@ def test_two_parameters_that_only_show_together_are_named_as_a_combination():
 
 def test_a_value_at_the_end_of_the_scale_is_flagged_and_its_interval_ends_there():
     residuals = np.random.default_rng(5).normal(0, 1e-3, ROWS)
-    found = from_jacobian(np.array([0.0, 0.6, 1.0]), residuals, linear_model(), SHAPES, noise=1e-3)
+    fit = Linearisation(np.array([0.0, 0.6, 1.0]), residuals, linear_model())
+    found = at_minimum(fit, LAYOUT, noise=1e-3)
     assert found.at_bound.tolist() == [True, False, True]
     assert found.lower[0] == 0
     assert found.upper[2] == 1
@@ -201,9 +207,9 @@ def test_an_interval_contains_the_optimum_of_a_finer_simulation():
     moved, residuals = fitted(jacobian, np.random.default_rng(6).normal(0, 1e-3, ROWS))
     finer_optimum = np.array([0.1, 0.0, -0.05])
     finer = residuals - jacobian @ finer_optimum
-    shift = optimum_shift(residuals, finer, jacobian)
+    shift = optimum_shift(Linearisation(POINT, residuals, jacobian), finer)
     assert shift == pytest.approx(finer_optimum, abs=1e-4)
-    found = from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3, shift=shift)
+    found = at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, shift=shift)
     assert (found.lower <= POINT + finer_optimum).all()
     assert (POINT + finer_optimum <= found.upper).all()
     assert found.std[1] < 0.02
@@ -216,15 +222,14 @@ def test_other_noise_of_the_initial_chains_widens_an_interval_by_what_it_moves()
     moved = np.zeros(ROWS)
     moved[rows] = jacobian[rows, 0] * 0.01
     share = np.sum(jacobian[rows]**2) / np.sum(jacobian**2)  # of what is known is from there
-    plain = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3)
-    found = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3,
-                          starts=[residuals + moved, residuals - moved])
+    fit = Linearisation(POINT[:1], residuals, jacobian)
+    plain = at_minimum(fit, LAYOUT, noise=1e-3)
+    found = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, residuals - moved])
     assert found.std[0] == pytest.approx(np.hypot(plain.std[0], 0.01 * share), rel=0.2)
     assert found.std[0] > 2 * plain.std[0]
-    unmoved = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3, starts=[residuals])
+    unmoved = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals])
     assert unmoved.std == pytest.approx(plain.std)
-    one_of_four = from_jacobian(POINT[:1], residuals, jacobian, SHAPES, noise=1e-3,
-                                starts=[residuals + moved, *[residuals] * 3])
+    one_of_four = at_minimum(fit, LAYOUT, noise=1e-3, starts=[residuals + moved, *[residuals] * 3])
     assert one_of_four.std[0] == pytest.approx(np.hypot(plain.std[0], 0.005 * share), rel=0.2)
 
 
@@ -234,7 +239,7 @@ def test_a_start_that_ends_elsewhere_altogether_is_an_outlier():
     there, further = residuals.copy(), residuals.copy()
     there[:30] += 0.1
     further[:30] += 10.0
-    near, far = (from_jacobian(POINT, residuals, jacobian, SHAPES, noise=1e-3, starts=[one])
+    near, far = (at_minimum(Linearisation(POINT, residuals, jacobian), LAYOUT, noise=1e-3, starts=[one])
                  for one in (there, further))
     assert far.std == pytest.approx(near.std)
 
@@ -243,19 +248,19 @@ def test_outliers_hardly_widen_the_intervals():
     residuals = np.random.default_rng(7).normal(0, 1e-3, ROWS)
     spoilt = residuals.copy()
     spoilt[::60] += 0.1
-    clean = from_jacobian(POINT, residuals, linear_model(), SHAPES, noise=1e-3)
-    found = from_jacobian(POINT, spoilt, linear_model(), SHAPES, noise=1e-3)
+    clean = at_minimum(Linearisation(POINT, residuals, linear_model()), LAYOUT, noise=1e-3)
+    found = at_minimum(Linearisation(POINT, spoilt, linear_model()), LAYOUT, noise=1e-3)
     assert (found.std < 3 * clean.std).all()
 
 
 def test_white_residuals_count_each_and_smooth_ones_do_not():
     generator = np.random.default_rng(8)
     white = generator.normal(size=3 * 10 * 50)
-    assert independence(white, [(10, 50)]) < 1.3
+    assert independence(white, ResidualLayout(((10, 50),))) < 1.3
     alike = np.repeat(generator.normal(size=(10, 10, 1, 3)), 5, axis=2)  # five neighbours each
-    assert 3 < independence(alike.ravel(), [(10, 50)]) < 8
+    assert 3 < independence(alike.ravel(), ResidualLayout(((10, 50),))) < 8
     in_time = np.repeat(generator.normal(size=(2, 1, 50, 3)), 5, axis=1)
-    assert independence(in_time.ravel(), [(10, 50)]) > 3
+    assert independence(in_time.ravel(), ResidualLayout(((10, 50),))) > 3
 
 
 def test_the_band_of_a_chain_follows_from_the_covariance():

@@ -21,9 +21,9 @@ from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.errors import InputError
 from dlo_calibration.inference.advice import Advice
-from dlo_calibration.inference.slices import cut
 from dlo_calibration.report.page import digests, MOST_TRIALS, Origin, repeating_command, write_report
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
@@ -89,7 +89,7 @@ def words(page):
 
 
 def test_every_element_is_closed_and_every_drawing_explained(result, page):
-    outline = Outline(page(result, slices=cut(result, ToySimulator())))
+    outline = Outline(page(result, slices=sliced(result, Options(), lambda _: ToySimulator())))
     assert outline.open == []
     assert [text for tag, text in outline.headings if tag == 'h1'] == ['Calibration of s']
     charts = [one for one in outline.drawings if one.get('role') == 'img']
@@ -99,7 +99,7 @@ def test_every_element_is_closed_and_every_drawing_explained(result, page):
 
 
 def test_needs_nothing_but_itself(result, page):
-    text = page(result, slices=cut(result, ToySimulator()))
+    text = page(result, slices=sliced(result, Options(), lambda _: ToySimulator()))
     ids = set(re.findall(' id="([^"]+)"', text))
     for reference in Outline(text).references:
         assert reference.startswith('#') and reference[1:] in ids
@@ -149,14 +149,14 @@ def test_search_shows_what_failed(result, page):
         evaluations = [replace(one, scores=(9.0,) * 3, skipped=0, failure='') for one in result.evaluations]
         evaluations[1] = replace(evaluations[1], **changes)
         found = replace(result, evaluations=tuple(evaluations))
-        return ' '.join(Outline(page(found, slices=cut(result, ToySimulator()))).text)
+        return ' '.join(Outline(page(found, slices=sliced(result, Options(), lambda _: ToySimulator()))).text)
 
     assert 'could not be simulated' not in searched()
     assert 'could not be simulated' in searched(scores=(), failure='diverged')
 
 
 def test_slices_are_drawn_or_said_to_be_left_out(result, page):
-    without, drawn = page(result), page(result, slices=cut(result, ToySimulator()))
+    without, drawn = page(result), page(result, slices=sliced(result, Options(), lambda _: ToySimulator()))
     assert 'Left out' in without
     assert 'Along flexibility' in drawn
     assert 'Left out' not in drawn
@@ -214,7 +214,7 @@ def framed(page: str, width: int, height: int) -> str:
 
 @pytest.mark.parametrize('width', WIDTHS)
 def test_browser_shows_it_without_scrolling_sideways(result, page, browse, tmp_path, width):
-    text = page(result, slices=cut(result, ToySimulator()))
+    text = page(result, slices=sliced(result, Options(), lambda _: ToySimulator()))
     frame, shot = tmp_path / 'frame.html', tmp_path / 'shot.png'
     frame.write_text(framed(text, width, 1000), encoding='utf-8')
     across, down = map(int, re.search(r'measured (\d+) (\d+)', browse('--dump-dom', frame.as_uri())).groups())

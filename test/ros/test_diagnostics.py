@@ -11,7 +11,7 @@ from wire import wire
 
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.inference.trial_information import Gain
+from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
@@ -104,7 +104,7 @@ def test_status_tells_state_trials_and_refusal(types, state, level):
 
 
 def test_status_tells_what_the_newest_trial_tells(types):
-    gain = Gain('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
+    gain = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
     one, values = by_name(diagnostics.status(types, stamp=STAMP, state='collecting', trials=2, gain=gain))[
         'status']
     assert values['last_trial'] == gain.words
@@ -114,7 +114,7 @@ def test_status_tells_what_the_newest_trial_tells(types):
     assert one.message == f'collecting; {gain.words}'
     failed, values = by_name(diagnostics.status(
         types, stamp=STAMP, state='failed', trials=2, detail='why',
-        gain=Gain.unknown('trial 2', ('friction',), 'it diverged')))['status']
+        gain=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
     assert values['last_trial'] == 'what trial 2 tells is not known: it diverged'
     assert not any(key.startswith('std_') for key in values)
     assert failed.message == 'failed: why'
