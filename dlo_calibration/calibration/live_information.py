@@ -46,10 +46,10 @@ _Known = dict[tuple[bytes, int], Union[Floats, str]]
 class _Job:
     """One appraisal: what it found so far, and whether it is to stop."""
 
-    def __init__(self, gains: queue.SimpleQueue[TrialInformation],
+    def __init__(self, found: queue.SimpleQueue[TrialInformation],
                  thread: threading.Thread | None = None) -> None:
         self.stop = threading.Event()
-        self.gains = gains
+        self.found = found
         self.thread = thread
 
 
@@ -70,7 +70,7 @@ class Appraiser:
 
     @property
     def alive(self) -> bool:
-        """Tell whether an appraisal is under way; gains may be waiting when it is not."""
+        """Tell whether an appraisal is under way; some of it may be waiting when it is not."""
         return self._job.thread is not None and self._job.thread.is_alive()
 
     def start(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None = None,
@@ -91,7 +91,7 @@ class Appraiser:
         text = json.dumps(options.flat(), sort_keys=True)
         if self._base is None or self._base[0] != text or self._base[1] is not result:
             self._base, self._known = (text, result), {}
-        self._job = _Job(self._job.gains)
+        self._job = _Job(self._job.found)
         self._job.thread = threading.Thread(
             target=self._work, args=(self._job, tuple(trials), options, result, self._known),
             name='appraisal', daemon=True)
@@ -108,11 +108,11 @@ class Appraiser:
             self._job.thread.join(timeout)
         return not self.alive
 
-    def waiting_gains(self) -> Iterator[TrialInformation]:
+    def waiting_information(self) -> Iterator[TrialInformation]:
         """Take what was found, without waiting for more."""
         while True:
             try:
-                yield self._job.gains.get_nowait()
+                yield self._job.found.get_nowait()
             except queue.Empty:
                 return
 
@@ -123,7 +123,7 @@ class Appraiser:
         except CancelledError:
             pass
         except Exception as error:  # whatever it is, nobody else need care
-            job.gains.put(TrialInformation.unknown(trials[-1].name, options.space.free, _one_line(error)))
+            job.found.put(TrialInformation.unknown(trials[-1].name, options.space.free, _one_line(error)))
 
     def _appraise(self, job: _Job, trials: Sequence[Trial], options: Options,
                   result: CalibrationResult | None, informations: _Known) -> None:
@@ -149,12 +149,12 @@ class Appraiser:
                         informations[key] = _one_line(error)
                 found = informations[key]
                 if isinstance(found, str):
-                    gain = TrialInformation.unknown(trial.name, known.names, found)
+                    told = TrialInformation.unknown(trial.name, known.names, found)
                 else:
                     after = known.after(found)
-                    gain, known = TrialInformation(trial.name, known.names, known.std, after.std), after
+                    told, known = TrialInformation(trial.name, known.names, known.std, after.std), after
                 if fresh:
-                    job.gains.put(gain)
+                    job.found.put(told)
 
 
 def _simulated(trial: Trial, known: Knowledge, space: ParameterSpace, simulator: Simulator, length: float,

@@ -39,9 +39,6 @@ from dlo_calibration.simulation.protocol import Simulator
 
 WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's
 MOST_SIMULATED = 3  # actions that are simulated beside all values
-CLOSED = 0.05  # of the length: ends that are nearer count as together
-REST = 1.0  # s after which a goal is compared at rest
-WATCHED = 8  # instants at which a moving DLO is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +187,8 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
     yield from _candidate(
         'lift the first end and lay it across the DLO, beyond two thirds of it', chain,
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
-    if gap < CLOSED * length:
-        return  # no line along which to move the ends
+    if gap < 0.05 * length:
+        return  # the ends are together: there is no line along which to move them
     yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     apart = 1.03 * length - gap
@@ -213,8 +210,8 @@ def _candidate(words: str, chain: Chain, named: NamedAction, watched: bool = Fal
     except InputError:
         return  # not with a chain of this shape
     held = tuple(hand.name for hand in action.hands) if named.hold else ()
-    goals = [Goal(chain, action.end + REST, held_by=held)]
+    goals = [Goal(chain, action.end + 1.0, held_by=held)]  # it is compared at rest
     if watched:
-        times = np.linspace(action.start, action.end, WATCHED + 1)[1:]
+        times = np.linspace(action.start, action.end, 9)[1:]
         goals = [Goal(chain, float(time), stable=False, held_by=held) for time in times]
     yield Candidate(named.name, words, Trial(words, chain, (action,), tuple(goals)))

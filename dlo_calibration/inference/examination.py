@@ -34,7 +34,6 @@ from dlo_calibration.model.score import distances, PointErrors
 
 SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:
 WIDE = 0.1  # that far at least
-WIDENINGS = 2  # after which the steps suit what is known
 FADED = 0.9  # of the effect that the end of an interval should have: less, and the end is further away
 DOUBLINGS = 4  # of the way there; then it may be anywhere on the scale
 ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
@@ -99,7 +98,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         return evaluate(points)
 
     at_default, = residuals_at(default[None, :])
-    fit = _linearised(point, residuals, layout, residuals_at, noise, WIDENINGS if thorough else 0)
+    fit = _linearised(point, residuals, layout, residuals_at, noise, 2 if thorough else 0)
     apart = _left_out_distances(fit, layout, residuals_at)
     shift = None
     if finer is not None:  # last: a worker keeps one simulator at a time

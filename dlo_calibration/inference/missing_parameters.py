@@ -18,9 +18,9 @@ from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, Par
 
 PARTS = 'parts'  # the name where it is parts of different stiffness that are missing
 TRIED_PARTS = 4  # so that a middle stiffer than both ends shows
-STEP = 0.15  # that a parameter is moved, in the unit cube;
-LONG_STEP = 0.5  # from where it is nothing at all
-FURTHEST = 2.0  # times that step, to which its effect is trusted to grow
+MOVE = 0.15  # that a parameter is moved, in the unit cube;
+LONG_MOVE = 0.5  # from where it is nothing at all
+FURTHEST = 2.0  # times that move, to which its effect is trusted to grow
 WORTH_TELLING = 0.1  # of the squares that are left
 
 
@@ -75,13 +75,13 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE
-        step = LONG_STEP if _is_nothing(parameter, now) else STEP
+        step = LONG_MOVE if _is_nothing(parameter, now) else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
                np.array([[now + step if now + step <= 1 else now - step]]))
     if space.parts == 1 and 'flexibility' in space.free:
         divided = space.divided(TRIED_PARTS)
         even = np.array([BY_NAME[name].default for name in PART_NAMES[:TRIED_PARTS - 1]]) / SCALE
-        yield PARTS, divided, even + STEP * np.eye(len(even))
+        yield PARTS, divided, even + MOVE * np.eye(len(even))
 
 
 def _is_nothing(parameter: Parameter, now: float) -> bool:

@@ -120,7 +120,7 @@ def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
 
 
 def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '', gain: TrialInformation | None = None) -> Any:
+           incomplete: str = '', detail: str = '', told: TrialInformation | None = None) -> Any:
     """
     Build the message about what the node is doing.
 
@@ -129,18 +129,18 @@ def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_ref
     :param last_refusal: text of the last refusal; empty where there was none.
     :param incomplete: what the newest trial lacks; empty where nothing.
     :param detail: of the state, e.g. why it failed.
-    :param gain: what the newest trial tells, once it is known.
+    :param told: what the newest trial tells, once it is known.
     """
     if state not in STATES:
         raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
     message = f'{state}: {detail}' if detail else state
-    last_trial = '' if gain is None else gain.words
+    last_trial = '' if told is None else told.words
     if last_trial and state == 'collecting':
         message += f'; {last_trial}'
     return _diagnostics(types, stamp, [_status(
         types, ERROR if state == 'failed' else OK, 'status', message,
         {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
-         'detail': detail, 'last_trial': last_trial, **({} if gain is None else gain.values)})])
+         'detail': detail, 'last_trial': last_trial, **({} if told is None else told.values)})])
 
 
 def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:

@@ -113,7 +113,7 @@ class _Memory:
     :param started: a calibration was started, so that none need start by itself.
     :param status: content of the last ``~/status``.
     :param result: of the last calibration.
-    :param gain: what the newest trial tells that was appraised.
+    :param information: what the newest trial tells that was appraised.
     """
 
     state: str = 'collecting'
@@ -124,7 +124,7 @@ class _Memory:
     started: bool = False
     status: dict[str, Any] = field(default_factory=dict)
     result: CalibrationResult | None = None
-    gain: TrialInformation | None = None
+    information: TrialInformation | None = None
     markers: _Pace = field(default_factory=_Pace)
     appraisal: _Pace = field(default_factory=_Pace)
 
@@ -328,8 +328,8 @@ class CalibrationSession:
     def _appraise(self) -> None:
         """Take what trials turned out to tell; have new ones appraised, unless a calibration is under way."""
         memory, now = self._memory, self._clock()
-        for gain in self._appraiser.waiting_gains():
-            memory.gain = gain
+        for told in self._appraiser.waiting_information():
+            memory.information = told
         quiet = now - memory.heard > QUIET
         if memory.appraisal.wanted and not self.calibrating and self._collector.count \
                 and not self._appraiser.alive and (quiet or now - memory.appraisal.last > STREAM_PERIOD):
@@ -354,7 +354,7 @@ class CalibrationSession:
         memory = self._memory
         content: dict[str, Any] = {
             'state': memory.state, 'trials': self._collector.count, 'last_refusal': memory.last_refusal,
-            'incomplete': self._collector.incomplete, 'detail': memory.detail, 'gain': memory.gain}
+            'incomplete': self._collector.incomplete, 'detail': memory.detail, 'told': memory.information}
         if content != memory.status:
             memory.status = content
             self._send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))

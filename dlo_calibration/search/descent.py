@@ -18,7 +18,7 @@ from dlo_calibration.search.protocol import Observation
 
 FIRST_RADIUS = 0.25  # of a step, in each parameter
 DAMPING = 1e-4  # of the largest column's length: enough that a parameter without effect stays
-NEAR = 0.03  # a Jacobian measured no further away than that counts as measured here
+NEAR = 0.03  # so near a Jacobian counts as measured here, and another minimum as the same
 RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
 
 

@@ -11,39 +11,30 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import both_sides, inward, slope
+from dlo_calibration.evaluation.linearisation import both_sides, inward, slope, STEP
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 
-STARTS_PER_PARAMETER = 2
-FEWEST_STARTS = 8
 FIRST_STEP = 0.015  # of a finite difference; beside a narrow valley larger ones lead astray
-LARGEST_STEP = 0.2
-VISIBLE = 0.2  # share of the loss's scale by which a finite difference is to change the residuals
-SMALLEST_STEP = 0.005  # below it, contacts that come and go are all that one sees
+SMALLEST_STEP, LARGEST_STEP = 0.005, 0.2  # below, contacts that come and go are all that one sees
+VISIBLE = 0.2  # share of the loss's threshold by which a finite difference is to change the residuals
 STEP_OVER_ROUGHNESS = 10.0  # a column's change over what the model could not predict
-LARGEST_RADIUS = 0.5
 SPECULATIVE = 1 / 4  # radius of the second point tried, in radii of the first
 DONE_STEP = 1e-3  # converged where the next step is not longer, in any parameter
 DONE_GAIN = 1e-4  # or would not lower the cost by more than this share of it
 NOISE_GAIN = 0.1  # or, where the residuals are rough, than this share of their roughness over their spread,
 MOST_ROUGHNESS = 0.03  # which counts no more than that
 SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
-SAME_PLACE = 0.03  # two descents that end that near to each other found the same minimum
-SAME_COST = 1e-3  # or that near in cost, as a share
-MOST_CHECKS = 2  # other starts followed once a minimum has been found
-BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too,
-BESIDE = 0.1  # unless it is that near
+SAME_COST = 1e-3  # two descents that end that near in cost, as a share, found the same minimum
+BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too
 WORTH_A_LOOK = 0.02  # share of the cost that such a place promises to save
-MOST_POLISHES = 3
-WIDE_STEP, WIDEST_STEP = 0.03, 0.15  # of the differences, to both sides, with which a minimum is polished
-SMOOTH = 0.01  # share of the loss's scale: the model that predicts so well sees no kinks
-DONE_POLISH = 2e-3  # share of the cost that is worth another look
-REACH = 0.1  # from such a place, in each parameter
-MOST_ITERATIONS = 25
+REACH = 0.1  # from such a place, in each parameter; a place that is nearer is not tried
+SMOOTH = 0.01  # share of the loss's threshold: the model that predicts so well sees no kinks
+DONE_POLISH = 2e-3  # share of the cost that is worth another look for kinks
+MOST_ITERATIONS = 25  # of a descent
 
 
 def lower(one: Floats, other: Floats) -> bool:
@@ -96,8 +87,8 @@ class LeastSquares(PlannedSearch):
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
         found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
-        while found < 2 and checks < MOST_CHECKS and not self._hints.refines:
-            starts = [one for one in starts if np.abs(one.point - best.point).max() > SAME_PLACE]
+        while found < 2 and checks < 2 and not self._hints.refines:
+            starts = [one for one in starts if np.abs(one.point - best.point).max() > NEAR]
             if not best.ended and not best.rivals(starts):
                 best = yield from self._descend(best, None, ())
             if best.ended:
@@ -134,12 +125,12 @@ class LeastSquares(PlannedSearch):
 
         :returns: where that leads to, which is here where nothing costs visibly less.
         """
-        for _ in range(MOST_POLISHES):
+        for _ in range(3):  # looks, each from where the one before led
             columns = np.flatnonzero(here.measured())
             if not len(columns) or here.roughness < SMOOTH * here.loss.threshold:
                 break
             least = self._least_effect[columns].max(initial=0.0) / self._least_effect
-            reach = np.clip(WIDE_STEP * np.sqrt(least), WIDE_STEP, WIDEST_STEP)
+            reach = np.clip(STEP * np.sqrt(least), STEP, 5 * STEP)
             points = both_sides(here.point, columns, reach)
             seen = yield points
             wide = here.jacobian.copy()
@@ -172,7 +163,7 @@ class LeastSquares(PlannedSearch):
         if not len(free):
             return []
         weakest = free[np.argmin(self._least_effect[free])]
-        targets = np.array([value for value in BEYOND if abs(value - here.point[weakest]) > BESIDE])
+        targets = np.array([value for value in BEYOND if abs(value - here.point[weakest]) > REACH])
         points = np.tile(here.point, (len(targets), 1))
         points[:, weakest] = targets
         observations = yield points
@@ -189,8 +180,8 @@ class LeastSquares(PlannedSearch):
         """Ask for start points until one can be simulated."""
         from scipy.stats import qmc
 
-        # Powers of two keep a Sobol sequence balanced.
-        count = 2 ** int(np.ceil(np.log2(max(FEWEST_STARTS, STARTS_PER_PARAMETER * self._dimension))))
+        # Two a parameter, and eight at least; powers of two keep a Sobol sequence balanced.
+        count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
         sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
         hint = np.clip(self._hints.start, 0, 1)
         if self._hints.refines:
@@ -220,7 +211,7 @@ class LeastSquares(PlannedSearch):
         costs = loss.cost(one.residuals), loss.cost(other.residuals)
         both = one.measured() & other.measured()
         apart = np.abs(one.point - other.point)[both].max(initial=0.0)
-        return bool(apart < SAME_PLACE or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
+        return bool(apart < NEAR or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
 
     def _to_lowest(self, descent: Descent) -> None:
         """Move to where another descent came by, if that costs less and is near."""
@@ -277,10 +268,10 @@ class LeastSquares(PlannedSearch):
         """Return whether a descent nears the known minimum, or flattens out above it."""
         target = here.point + step
         both = here.measured() & known.measured()
-        near = np.abs(target - known.point)[both].max(initial=0.0) < SAME_PLACE and (
-            np.abs(here.point - known.point)[both].max(initial=0.0) < 2 * SAME_PLACE)
+        near = np.abs(target - known.point)[both].max(initial=0.0) < NEAR and (
+            np.abs(here.point - known.point)[both].max(initial=0.0) < 2 * NEAR)
         higher = known.loss.cost(here.residuals) > known.cost
-        flat = float(np.abs(step).max(initial=0.0)) < SAME_PLACE / 3
+        flat = float(np.abs(step).max(initial=0.0)) < NEAR / 3
         return bool(higher and (near or flat))
 
     def _try(self, here: Descent) -> Generator[Floats, Sequence[Observation], bool]:
@@ -300,7 +291,7 @@ class LeastSquares(PlannedSearch):
         if moved:
             here.move(observations[chosen])
             if good and chosen == 0:
-                here.radius = min(max(here.radius, 2 * length), LARGEST_RADIUS)
+                here.radius = min(max(here.radius, 2 * length), 0.5)
             elif chosen == 1 or not good:
                 here.radius = max(length, here.radius * SPECULATIVE) if good else length / 2
         else:

@@ -25,10 +25,10 @@ TRIALS = toy_trials(3)
 
 
 def appraised(appraiser, trials, *rest, **more):
-    """Return the gains of one appraisal."""
+    """Return what one appraisal finds."""
     appraiser.start(trials, OPTIONS, *rest, **more)
     assert appraiser.join(PATIENCE)
-    return list(appraiser.waiting_gains())
+    return list(appraiser.waiting_information())
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_each_trial_is_appraised_once_after_those_before_it(appraiser):
 def test_a_trial_that_changed_is_appraised_again(appraiser):
     appraised(appraiser, TRIALS[:1])
     later = replace(TRIALS[0], goals=(replace(TRIALS[0].goals[0], time=3.0),))
-    assert [gain.trial for gain in appraised(appraiser, [later])] == ['trial 1']
+    assert [told.trial for told in appraised(appraiser, [later])] == ['trial 1']
     more = replace(later, goals=(*later.goals, replace(later.goals[0], time=4.0)))  # it still lies there
     assert appraised(appraiser, [more]) == []
 
@@ -67,39 +67,39 @@ def test_a_repeat_to_the_digit_is_a_trial_of_its_own(appraiser):
 def test_what_is_forgotten_is_appraised_anew(appraiser):
     appraised(appraiser, TRIALS[:1])
     appraiser.stop()
-    assert [gain.trial for gain in appraised(appraiser, TRIALS[:1])] == ['trial 1']
+    assert [told.trial for told in appraised(appraiser, TRIALS[:1])] == ['trial 1']
 
 
 def test_a_trial_under_way_waits_until_it_has_a_goal_at_rest(appraiser):
     chain = TRIALS[1].goals[0].chain
     moving = replace(TRIALS[1], goals=(Goal(chain, 1.0, stable=False),))
-    assert [gain.trial for gain in appraised(appraiser, [TRIALS[0], moving], whole=False)] == ['trial 1']
-    assert [gain.trial for gain in appraised(appraiser, [TRIALS[0], moving])] == ['trial 2']
+    assert [told.trial for told in appraised(appraiser, [TRIALS[0], moving], whole=False)] == ['trial 1']
+    assert [told.trial for told in appraised(appraiser, [TRIALS[0], moving])] == ['trial 2']
 
 
 def test_trials_of_a_result_are_not_appraised_and_later_ones_add_to_it(appraiser):
     result = calibrate(TRIALS[:2], OPTIONS, make_simulator=new_toy)
     assert result.examination.regular
-    gain, = appraised(appraiser, TRIALS, result)
-    assert gain.trial == 'trial 3'
-    assert gain.before == pytest.approx(result.examination.uncertainty.std, rel=1e-3)
+    told, = appraised(appraiser, TRIALS, result)
+    assert told.trial == 'trial 3'
+    assert told.before == pytest.approx(result.examination.uncertainty.std, rel=1e-3)
 
 
 @pytest.mark.parametrize(('toy', 'words'), [
     (ToySimulator(fail_below=101.0), 'trial 1: diverged'),
     (ToySimulator(crash=True), 'RuntimeError: the toy')])
 def test_a_trial_that_cannot_be_simulated_gives_a_sentence(toy, words):
-    gain, = appraised(Appraiser(lambda _: toy), TRIALS[:1])
-    assert gain.problem.startswith(words)
-    assert '\n' not in gain.words
+    told, = appraised(Appraiser(lambda _: toy), TRIALS[:1])
+    assert told.problem.startswith(words)
+    assert '\n' not in told.words
 
 
 def test_an_engine_that_cannot_be_had_gives_a_sentence():
     def refuse(options):
         raise DloCalibrationError('no such engine')
 
-    gain, = appraised(Appraiser(refuse), TRIALS[:2])
-    assert gain.words == 'what trial 2 tells is not known: no such engine'
+    told, = appraised(Appraiser(refuse), TRIALS[:2])
+    assert told.words == 'what trial 2 tells is not known: no such engine'
 
 
 def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
@@ -115,4 +115,4 @@ def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
     appraiser.stop()
     assert appraiser.join(PATIENCE)
     assert not any('spawn_main' in line for pid, line in children(os.getpid()).items() if pid not in before)
-    assert list(appraiser.waiting_gains()) == []
+    assert list(appraiser.waiting_information()) == []

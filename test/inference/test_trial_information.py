@@ -43,7 +43,7 @@ class Blind(ToySimulator):
         return super().simulate(trial, shown)
 
 
-def gains(trials, simulator):
+def told(trials, simulator):
     """Return what each trial adds to those before."""
     known, found = knowledge(trials, SPACE, 0.0), []
     for trial in trials:
@@ -74,7 +74,7 @@ def test_rougher_chains_tell_less():
 
 def test_a_trial_tells_what_it_shows_and_a_repeat_nothing_new():
     trials = [FIRST, replace(FIRST, name='trial 2'), replace(FIRST, name='trial 2')]
-    first, second, third = gains(trials, Blind())
+    first, second, third = told(trials, Blind())
     assert first.told == ('flexibility',)
     assert second.told == ('friction',)
     assert third.told == ()
@@ -118,10 +118,10 @@ def test_a_trial_that_cannot_be_simulated_says_so():
     known = knowledge([FIRST], SPACE, 0.0)
     with pytest.raises(SimulationError, match='diverged'):
         simulated_information(FIRST, known, SPACE, ToySimulator(fail_below=101.0), 1.0, 0.0)
-    gain = TrialInformation.unknown('trial 3', SPACE.free, 'it diverged')
-    assert gain.words == 'what trial 3 tells is not known: it diverged'
-    assert gain.values == {}
-    assert gain.told == ()
+    told = TrialInformation.unknown('trial 3', SPACE.free, 'it diverged')
+    assert told.words == 'what trial 3 tells is not known: it diverged'
+    assert told.values == {}
+    assert told.told == ()
 
 
 def stream(count):

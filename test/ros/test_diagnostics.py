@@ -104,17 +104,17 @@ def test_status_tells_state_trials_and_refusal(types, state, level):
 
 
 def test_status_tells_what_the_newest_trial_tells(types):
-    gain = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
-    one, values = by_name(diagnostics.status(types, stamp=STAMP, state='collecting', trials=2, gain=gain))[
+    told = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
+    one, values = by_name(diagnostics.status(types, stamp=STAMP, state='collecting', trials=2, told=told))[
         'status']
-    assert values['last_trial'] == gain.words
+    assert values['last_trial'] == told.words
     assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
         'std_before_flexibility': 6.25, 'std_before_friction': 25.0,
         'std_after_flexibility': 1.5625, 'std_after_friction': 25.0}
-    assert one.message == f'collecting; {gain.words}'
+    assert one.message == f'collecting; {told.words}'
     failed, values = by_name(diagnostics.status(
         types, stamp=STAMP, state='failed', trials=2, detail='why',
-        gain=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
+        told=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
     assert values['last_trial'] == 'what trial 2 tells is not known: it diverged'
     assert not any(key.startswith('std_') for key in values)
     assert failed.message == 'failed: why'
