@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import prior
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -120,8 +119,7 @@ def test_an_optimum_on_the_border_is_found():
 def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_place():
     # Of sample object2, both end where the DLO stretches too easily, and less friction makes up for it.
     session = read_session(Path(__file__).resolve().parents[2] / 'msg_samples/object2', None)
-    options = Options.of(session.options or {})
-    trials, _ = session_trials(session, options)
+    trials, options = session.trials, session.options
     evaluator = Evaluator(trials, options.space, CompiledSimulator())
     search = LeastSquares(options.space.dimension, 10, prior(trials, options).hints)
     while len(points := search.ask(150)):
