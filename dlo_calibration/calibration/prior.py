@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Sequence
 
+import numpy as np
+
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.estimate import start_point
@@ -39,9 +40,8 @@ def prior(trials: Sequence[Trial], options: Options) -> Prior:
     """Return what the observed chains alone say of the parameters that `options` ask for."""
     space = options.space
     height = options.table_height if options.table else None
-    hints = replace(Hints.none(space.dimension), start=start_point(trials, space, height),
-                    rows=tuple(rows.stop - rows.start for rows in ResidualLayout.of(trials).rows),
-                    excites=excites(trials, space, height))
+    shown = np.logical_or.reduce(excites(trials, space, height))
+    hints = Hints(start_point(trials, space, height), shown)
     default = BY_NAME[GUESSED].default
     if GUESSED not in space.free or space.fixed.get(GUESSED, default) != default:
         return Prior(space, hints)

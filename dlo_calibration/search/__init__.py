@@ -11,15 +11,12 @@ from dlo_calibration.search.cma_es import CmaEs
 from dlo_calibration.search.least_squares import LeastSquares
 from dlo_calibration.search.protocol import Hints, Observation, Search
 from dlo_calibration.search.random import RandomSearch
-from dlo_calibration.search.sequential import Sequential
 
-__all__ = ['CmaEs', 'Hints', 'LeastSquares', 'Observation', 'RandomSearch', 'Search', 'SEARCHES',
-           'Sequential']
+__all__ = ['CmaEs', 'Hints', 'LeastSquares', 'Observation', 'RandomSearch', 'Search', 'SEARCHES']
 
 #: name -> constructor(dimension, seed, hints=None)
 SEARCHES: Mapping[str, Callable[..., Search]] = {
     LeastSquares.name: LeastSquares,
     RandomSearch.name: RandomSearch,
     CmaEs.name: CmaEs,
-    Sequential.name: Sequential,
 }

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, Sequence
 
 import numpy as np
@@ -35,44 +35,28 @@ class Hints:
     """
     What is known before the first evaluation, in the unit cube of d parameters.
 
-    :param start: (d,) estimate; nan where there is none.
-    :param lower: (d,) lower end of the range of that estimate; 0 where there is none.
-    :param upper: (d,) upper end; 1 where there is none.
-    :param rows: how many residuals each of T trials has, in order; empty where
-        that is not known.
-    :param excites: (T, d) True where a trial excites a parameter.
-    :param refines: `start` is where a search of a simpler model ended: no other start is worth a try.
+    :param start: (d,) prior estimate; nan where there is none.
+    :param excited: (d,) False where surely no trial shows a parameter.
+    :param refines: `start` is where the search of a simpler model ended: no other start is worth a try.
     """
 
     start: Floats
-    lower: Floats
-    upper: Floats
-    rows: tuple[int, ...]
-    excites: NDArray[np.bool_]
+    excited: NDArray[np.bool_]
     refines: bool = False
 
     def __post_init__(self) -> None:
-        for name in ('start', 'lower', 'upper'):
-            object.__setattr__(self, name, frozen_array(getattr(self, name)))
-        excites = np.array(self.excites, dtype=np.bool_)
-        excites.flags.writeable = False
-        object.__setattr__(self, 'excites', excites)
+        object.__setattr__(self, 'start', frozen_array(self.start))
+        object.__setattr__(self, 'excited', frozen_array(self.excited, bool))
 
     @classmethod
     def none(cls, dimension: int) -> Hints:
         """Return hints that tell nothing."""
-        blank = np.zeros(dimension)
-        return cls(blank * np.nan, blank, blank + 1, (), np.zeros((0, dimension), dtype=np.bool_))
+        return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_))
 
     @classmethod
     def at(cls, start: Floats) -> Hints:
         """Return hints that (d,) `start` is where a search of a simpler model ended."""
-        return replace(cls.none(len(start)), start=start, refines=True)
-
-    @property
-    def excited(self) -> NDArray[np.bool_]:
-        """(d,) True for the parameters that some trial excites; all where nothing is known."""
-        return np.logical_or.reduce(self.excites) if len(self.excites) else np.ones(len(self.start), np.bool_)
+        return cls(start, np.ones(len(start), np.bool_), refines=True)
 
 
 class Search(Protocol):

@@ -38,12 +38,12 @@ def task(left_out=None, search='random', seed=1, engine='toy', **about):
 
 
 def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back():
-    found = list(tasks([subject(name='a'), subject(held_back=(1,), name='b')], ['random', 'sequential'], 2, 7,
+    found = list(tasks([subject(name='a'), subject(held_back=(1,), name='b')], ['random', 'cma_es'], 2, 7,
                        {'a': 'x', 'b': 'y'}))
     assert [(one.subject.name, one.search, one.left_out) for one in found if one.seed == 7] == [
         ('a', 'random', None), ('a', 'random', 0), ('a', 'random', 1), ('a', 'random', 2),
-        ('a', 'sequential', None), ('a', 'sequential', 0), ('a', 'sequential', 1), ('a', 'sequential', 2),
-        ('b', 'random', None), ('b', 'random', 1), ('b', 'sequential', None), ('b', 'sequential', 1)]
+        ('a', 'cma_es', None), ('a', 'cma_es', 0), ('a', 'cma_es', 1), ('a', 'cma_es', 2),
+        ('b', 'random', None), ('b', 'random', 1), ('b', 'cma_es', None), ('b', 'cma_es', 1)]
     assert [one.seed for one in found] == [7] * 12 + [8] * 12
     assert {one.engine for one in found if one.subject.name == 'b'} == {'y'}
     assert [trial.name for trial in found[2].trials] == ['trial 1', 'trial 3']
@@ -134,7 +134,7 @@ def test_a_stopped_calibration_is_none():
 
 
 @pytest.mark.parametrize('other', [
-    task(seed=2), task(search='sequential'), task(left_out=0), task(engine='bullet'), task(count=4),
+    task(seed=2), task(search='cma_es'), task(left_out=0), task(engine='bullet'), task(count=4),
     task(options=Options.of({'evaluations': 41})), task(options=Options.of({'evaluations': 40, 'mass': 0.1})),
     task(held_back=(), others=Observed(tuple(toy_trials(1)), OPTIONS)),
 ], ids=['seed', 'search', 'trials', 'engine', 'session', 'budget', 'mass', 'judges'])
@@ -172,10 +172,10 @@ def test_lines_that_are_none_do_not_count_and_spoil_nothing(tmp_path, rest):
 
 
 def test_the_journal_says_what_a_line_is_of(tmp_path):
-    Journal(tmp_path / 'x').add(task(left_out=1, search='sequential', seed=5), OUTCOME)
+    Journal(tmp_path / 'x').add(task(left_out=1, search='cma_es', seed=5), OUTCOME)
     entry = json.loads((tmp_path / 'x').read_text())
     assert (entry['object'], entry['search'], entry['seed'], entry['left_out'], entry['engine']) == (
-        'rope', 'sequential', 5, 2, 'toy')
+        'rope', 'cma_es', 5, 2, 'toy')
 
 
 def test_a_journal_that_cannot_be_read_or_written_is_refused(tmp_path):

@@ -87,7 +87,7 @@ def test_the_lower_of_two_minima_is_found_from_any_seed():
 
 
 def test_a_parameter_without_effect_keeps_the_value_of_its_start():
-    hints = Hints([np.nan, 0.4, np.nan], [0.0] * 3, [1.0] * 3, (90,), [[True, False, True]])
+    hints = Hints([np.nan, 0.4, np.nan], [True, False, True])
     search = solve(lambda point: valley(point, flat=(1,)), hints=hints)[0]
     assert search.best[1] == 0.4
 
@@ -102,11 +102,11 @@ def test_a_parameter_that_only_trembles_is_not_moved_by_chance():
 
 
 def test_the_first_point_asked_keeps_to_the_estimate_and_others_do_not():
-    hints = Hints([0.9, np.nan, 0.1], [0.8, 0, 0], [1, 1, 0.2], (90,), [[True] * 3])
+    hints = Hints([0.9, np.nan, 0.1], [True] * 3)
     asked = LeastSquares(3, 1, hints).ask(100)
     kept = (asked[:, [0, 2]] == [0.9, 0.1]).all(axis=1)
     assert 0 < kept.sum() < len(asked)
-    wrong = Hints([0.1, np.nan, np.nan], [0, 0, 0], [0.2, 1, 1], (90,), [[True] * 3])
+    wrong = Hints([0.1, np.nan, np.nan], [True] * 3)
     assert solve(valley, hints=wrong)[0].best == pytest.approx(TRUTH, abs=0.005)
 
 

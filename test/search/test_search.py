@@ -13,7 +13,6 @@ from dlo_calibration.search import Hints, Observation, SEARCHES
 NAMES = [pytest.param(name, marks=pytest.mark.skipif(
     name == 'cma_es' and find_spec('cma') is None, reason='the library cma is not installed'))
     for name in SEARCHES]
-SEEDED = [name for name in NAMES if name.values != ('sequential',)]
 MEASURED = [name for name in NAMES if name.values != ('random',)]  # that use what they are told
 
 
@@ -86,7 +85,7 @@ def test_the_same_seed_gives_the_same_points_bit_for_bit(name):
     assert first.tobytes() == walk(name, 4, 5, 50)[1].tobytes()
 
 
-@pytest.mark.parametrize('name', SEEDED)
+@pytest.mark.parametrize('name', NAMES)
 def test_another_seed_gives_other_points(name):
     assert walk(name, 4, 5, 50)[1].tobytes() != walk(name, 4, 6, 50)[1].tobytes()
 
@@ -159,7 +158,7 @@ def test_where_nothing_has_an_effect_it_ends(name):
 
 @pytest.mark.parametrize('name', MEASURED)
 def test_a_hint_is_where_it_begins(name):
-    hints = Hints([0.7, np.nan], [0.6, 0.0], [0.8, 1.0], (40,), [[True, True]])
+    hints = Hints([0.7, np.nan], [True, True])
     asked = walk(name, 2, 1, 20, hints=hints)[1]
     assert np.abs(asked[:6, 0] - 0.7).min() < 0.35
     again = walk(name, 2, 1, 20)[1]
@@ -169,12 +168,6 @@ def test_a_hint_is_where_it_begins(name):
 @pytest.mark.parametrize('name', NAMES)
 def test_hints_that_tell_nothing_change_nothing(name):
     assert walk(name, 3, 1, 30)[1].tobytes() == walk(name, 3, 1, 30, hints=Hints.none(3))[1].tobytes()
-
-
-def test_hints_tell_which_parameters_are_excited():
-    assert Hints.none(2).excited.tolist() == [True, True]
-    hints = Hints([0.5] * 3, [0] * 3, [1] * 3, (4, 5), [[True, False, False], [True, False, True]])
-    assert hints.excited.tolist() == [True, False, True]
 
 
 def test_random_points_do_not_depend_on_how_the_asking_is_split():
