@@ -13,8 +13,6 @@ from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.protocol import Simulator
 
-INSTALL = 'pip install numba, or apt install python3-numba'
-SLOWER = 'rounds are simulated by PyBullet, about 30 times slower, because'
 SimulatorFactory = Callable[[Options], Simulator]
 
 LOG = logging.getLogger('dlo_calibration.calibration.engines')
@@ -30,23 +28,16 @@ def _compiled(options: Options) -> Simulator:
     if options.scene:
         raise InputError('engine compiled', f'scene {options.scene}', 'no scene, for it knows only a table',
                          'use engine bullet or auto')
-    try:
-        from dlo_calibration.simulation.compiled import CompiledSimulator
-    except ImportError as error:
-        raise InputError('engine compiled', f'a Python where {_lacks(error)}', 'an installed numba',
-                         f'{INSTALL}; or use engine bullet or auto') from error
+    from dlo_calibration.simulation.compiled import CompiledSimulator
+
     return CompiledSimulator(**_settings(options))
 
 
 def _auto(options: Options) -> Simulator:
-    """Return the compiled engine where it can simulate, else Bullet, which is told once."""
+    """Return the compiled engine where there is no scene, else Bullet, which is told once."""
     if options.scene:
-        _tell(f'{SLOWER} engine compiled knows no scene: {options.scene}')
-        return _bullet(options)
-    try:
-        import dlo_calibration.simulation.compiled  # noqa: F401  only to see whether it can be
-    except ImportError as error:
-        _tell(f'{SLOWER} {_lacks(error)}: {INSTALL}')
+        _tell('rounds are simulated by PyBullet, about 30 times slower, because engine compiled knows no '
+              f'scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)
 
@@ -56,13 +47,6 @@ def _settings(options: Options) -> dict[str, Any]:
     return {'table': options.table, 'table_height': options.table_height, 'nodes': options.nodes,
             'time_step': options.time_step, 'stable_distance': options.stable_distance,
             'stable_time': options.stable_time, 'settle_limit': options.settle_limit}
-
-
-def _lacks(error: ImportError) -> str:
-    """Return why the compiled engine cannot be imported."""
-    if isinstance(error, ModuleNotFoundError) and error.name == 'numba':
-        return 'numba is not installed'
-    return f'numba cannot be used ({" ".join(str(error).split())})'
 
 
 @functools.cache

@@ -4,15 +4,14 @@
 """
 The PyBullet engine: a rope in any PyBullet world, and trials simulated with it.
 
-The rope's nodes are spheres.  Each step, `rod` gives their velocities from the
-internal forces and gravity, `contact` keeps the rope from passing through
-itself, and Bullet does contact and friction with everything else.
+The rope's nodes are spheres.  Each step, `kernels` give their velocities from the
+internal forces, gravity and the rope's contact with itself, and Bullet does contact
+and friction with everything else.
 """
 
 from __future__ import annotations
 
 from contextlib import contextmanager
-import copy
 import ctypes
 import os
 from typing import Any, Iterator, Mapping, Sequence
@@ -21,14 +20,12 @@ import numpy as np
 
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.table import rest_on, resting_level
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import feature_shares, Layout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene, unusable
-from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
-from dlo_calibration.simulation.rod import Rod, RodProperties
-from dlo_calibration.simulation.rollout import roll_out, Settling
-from dlo_calibration.simulation.self_contact import SelfContact
+from dlo_calibration.simulation.protocol import DEFAULT_NODES
+from dlo_calibration.simulation.rope import diverged, Rope
 
 
 @contextmanager
@@ -109,15 +106,10 @@ class BulletRope:
               velocities: Floats | None = None, features: Floats | None = None) -> None:
         """Start anew, with other properties, without building anything in the world."""
         assert len(places) == len(points) == len(self.bodies)
-        self._points = np.array(points, dtype=float)
-        self._velocities = np.zeros_like(self._points) if velocities is None else np.array(velocities)
-        self._support = np.zeros_like(self._points)
-        properties = RodProperties.of(physical)
-        self._rod = Rod(np.diff(places), properties, self.time_step, features)
-        self._contact = SelfContact(places * properties.length_scale, physical['self_collision'],
-                                    physical['friction'], self.time_step)
-        self._contact.start(self._points)
-        for body, mass, point in zip(self.bodies, self._rod.masses, self._points.tolist(), strict=True):
+        velocities = np.zeros((len(places), 3)) if velocities is None else velocities
+        self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features)
+        state = self._rope.state
+        for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
             pybullet.changeDynamics(
                 body, -1, mass=mass, localInertiaDiagonal=[INERTIA] * 3, lateralFriction=physical['friction'],
                 restitution=0.0, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client)
@@ -127,26 +119,12 @@ class BulletRope:
     @property
     def points(self) -> Floats:
         """The nodes' positions now, (N, 3) [m]; a copy."""
-        return self._points.copy()
-
-    @property
-    def velocities(self) -> Floats:
-        """The nodes' velocities now, (N, 3) [m/s]; a copy."""
-        return self._velocities.copy()
-
-    @property
-    def held(self) -> tuple[int, ...]:
-        """The nodes that are held, in the order that targets are given in."""
-        return self._held
+        return self._rope.points
 
     def hold(self, nodes: Sequence[int]) -> None:
         """Hold exactly these nodes from now on; none: let go."""
-        self._held = tuple(dict.fromkeys(int(node) for node in nodes))
-        self._order = np.argsort(self._held)
-        self._rod.hold(self._held)
-        self._inverse_masses = 1 / self._rod.masses
-        self._inverse_masses[list(self._held)] = 0.0
-        self._targets = self._points[list(self._held)]
+        self._rope.hold(tuple(dict.fromkeys(int(node) for node in nodes)))
+        self._targets = self._rope.state.points[self._rope.state.rod.held]
 
     def step(self, targets: Floats | None = None) -> None:
         """Take one step of the whole world; see `before_step`."""
@@ -162,30 +140,27 @@ class BulletRope:
             None: where they were.
         :raises SimulationError: where the rollout diverges.
         """
-        held = list(self._held)
+        state = self._rope.state
         if targets is not None:
-            self._targets = np.array(targets)
-        follow = (self._targets - self._points[held]) / self.time_step
-        wanted = self._rod.velocities(self._points, self._velocities, self._gravity, follow[self._order])
-        wanted[held] = follow
-        wanted = self._contact.velocities(self._points, wanted, self._inverse_masses, self._support)
-        self._wanted = wanted
-        sent = wanted - self._gravity * self.time_step  # Bullet adds it again
+            self._targets = np.array(targets, dtype=float)
+        if not kernels.want(state, self._targets):
+            raise diverged()
+        sent = state.wanted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client
         for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
             pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
 
     def after_step(self) -> None:
         """Take the positions and velocities that contacts left."""
-        client = self._client
-        for node, target in zip(self._held, self._targets.tolist(), strict=True):
+        client, state = self._client, self._rope.state
+        for node, target in zip(state.rod.held, self._targets.tolist(), strict=True):
             pybullet.resetBasePositionAndOrientation(self.bodies[node], target, NO_TURN,
                                                      physicsClientId=client)
         points = np.array([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
                            for body in self.bodies])
-        self._velocities = (points - self._points) / self.time_step
-        self._support = self._velocities - self._wanted
-        self._points = points
+        state.velocities[:] = (points - state.points) / self.time_step
+        state.support[:] = state.velocities - state.wanted
+        state.points[:] = points
 
     def advance(self, targets: Floats, path: Floats | None = None) -> None:
         """
@@ -196,7 +171,7 @@ class BulletRope:
         for k, target in enumerate(targets):
             self.step(target)
             if path is not None:
-                path[k] = self._points
+                path[k] = self._rope.state.points
 
     def remove(self) -> None:
         """Take the rope out of the world."""
@@ -243,84 +218,51 @@ def _obstacles(scene: str) -> tuple[Obstacle, ...]:
     return found
 
 
-class BulletSimulator:
+class BulletSimulator(Engine):
     """
     Simulates trials in a PyBullet world of its own: the rope, a table or none, and a scene or none.
 
-    The world is built at the first trial and reset for every other.  The table
-    is placed so that the rope rests on it at the measured height, whatever
-    radius is tried, so that a radius neither kicks it up nor lets it fall.
+    The world is built at the first trial and reset for every other.
 
     Obstacles of a scene stay where they are, and the rope touches them with the
     radius that is tried.  Bullet cannot change the radius of a sphere, so the
     world is built anew for every other radius: about 20 ms, and what reading
     the scene's meshes takes.
 
-    :param table: whether there is a table.
-    :param table_height: [m].
-    :param nodes: of the rope.
-    :param time_step: [s].
-    :param stable_distance: see `Settling` [m].
-    :param stable_time: see `Settling` [s].
-    :param settle_limit: see `Settling` [s].
     :param scene: path of a URDF file with fixed obstacles; empty: none.
+    :param settings: see `Engine`.
     :raises InputError: where the scene cannot be used.
     """
 
     name = 'bullet'
 
-    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
-                 time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
-                 stable_time: float = Settling.time, settle_limit: float = Settling.limit,
-                 scene: str = '') -> None:
-        self._table_height = table_height if table else None
-        self._nodes = nodes
-        self._time_step = time_step
-        self._settling = Settling(stable_distance, stable_time, settle_limit)
+    def __init__(self, *, scene: str = '', **settings: Any) -> None:
+        super().__init__(**settings)
         self._obstacles = _obstacles(scene) if scene else ()
         self._world: _World | None = None
 
-    def prepare(self) -> None:
-        """Need nothing that copies could share."""
-
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        """
-        Simulate a trial with physical parameters by name (SI units).
-
-        :raises SimulationError: where the rollout diverges.
-        :raises InputError: where the trial grips more points than there are nodes.
-        """
-        layout = Layout.of(trial, self._nodes)
-        points = layout.points
-        touching = None
-        if self._table_height is not None:
-            touching = resting_level(trial, self._table_height)
-            if touching is None:
-                touching = self._table_height + physical['self_collision']
-            points = rest_on(points, touching)
+    def _rope(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+              level: float | None) -> BulletRope:
         radius = physical['self_collision'] if self._obstacles else _World.SPHERE
         if self._world is not None and self._world.radius != radius:
-            self.close()
+            self._end()
         if self._world is None:
             self._world = _World(layout, physical, self._time_step, radius, self._obstacles)
-        rope = self._world.start(layout, points, physical, touching)
-        return roll_out(trial, layout, rope, self._settling)
-
-    def refined(self) -> BulletSimulator:
-        """Return one with twice the segments and half the time step."""
-        finer = copy.copy(self)
-        finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
-        return finer
+        return self._world.start(layout, points, physical, level)
 
     def close(self) -> None:
-        """End the PyBullet client; the next trial starts another."""
+        """Forget the trials, and end the PyBullet client; the next trial starts another."""
+        super().close()
+        self._end()
+
+    def _end(self) -> None:
         if self._world is not None:
             self._world.close()
             self._world = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the PyBullet client behind: it belongs to this process."""
-        return {**self.__dict__, '_world': None}
+        """Leave the PyBullet client behind, too: it belongs to this process."""
+        return {**super().__getstate__(), '_world': None}
 
 
 class _World:

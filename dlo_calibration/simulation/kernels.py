@@ -2,57 +2,233 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Kernels: the steps of `rod`, `natural`, `contact` and a table with friction, compiled by Numba.
+Kernels: the physics of a DLO, compiled by Numba.
 
-They compute what `rod.Rod.velocities`, `natural.natural_forces` and `contact.SelfContact.velocities` do, and
-what Bullet does with spheres on a plane, for many steps in one call.  The machine
-code is kept in Numba's cache, so that it is compiled once a machine.  They are all in
-one file, because a change of this file is all that the cache looks at.
+The rod and what bends it, twist between clamps, contact of a DLO with itself, and a table
+with friction.  The machine code is kept in Numba's cache, so that it is compiled once a
+machine.  All kernels are in one file, because a change of this file is all that the cache
+looks at.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Callable, TypeVar
+from typing import Any, Callable, NamedTuple, TypeVar
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.simulation.natural import HAIRPIN, ROUNDED
-from dlo_calibration.simulation.rod import HELD
-from dlo_calibration.simulation.self_contact import (
-    FASTEST_PUSH_OUT,
-    ITERATIONS,
-    PUSH_OUT,
-    SUPPORTED,
-    TINY,
-    UNSUPPORTED,
-    WEDGED,
-)
-from dlo_calibration.simulation.twist import ANGLE, BEGUN, COLUMNS, END, FIRST, LAST, START, STIFFNESS
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
+
+# How a signature says the number of axes:
+Vector = Floats
+Matrix = Floats
+Cube = Floats
+Indices = NDArray[np.int64]
+IndexRows = NDArray[np.int64]
+#: type that a kernel is compiled for, by the annotation
+TYPES: dict[str, Any] = {
+    'None': numba.void, 'bool': numba.boolean, 'int': numba.int64, 'float': numba.float64,
+    'Vector': numba.float64[::1], 'Matrix': numba.float64[:, ::1], 'Cube': numba.float64[:, :, ::1],
+    'Indices': numba.int64[::1], 'IndexRows': numba.int64[:, ::1]}
+
+HELD = 1e12  # a held node's share of the matrix, relative to its mass
+ROUNDED = 0.05  # rad of the bends in all below which the direction of the natural curvature is not settled
+HAIRPIN = 0.01  # least squared cosine of half the angle between two segments
+TINY = 1e-12  # m or m/s; a smaller vector has no direction
+
+# Contact of a DLO with itself:
+ITERATIONS = 10
+PUSH_OUT = 0.8  # share of a penetration that one step removes
+FASTEST_PUSH_OUT = 0.8  # m/s, so that nothing is kicked
+SUPPORTED = 0.5  # cosine between a push and the support against it
+UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding
+WEDGED = 0.1  # a pair of which less than that share can yield is wedged: then all of it does
+STRETCH = 1.2  # how much longer than at rest a segment may be for its pairs to be found
+SKIN = 0.004  # m; pairs that near are watched until the nodes may have moved that far
 
 # Bullet's treatment of a contact, as found by single steps of a sphere on a plane (PyBullet 3.2.7):
 SLOP = 1e-5  # m that it lets a contact penetrate
 PUSHED_OUT = 0.08  # share of a deeper penetration that one step removes
 CONTACT = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
 
-VECTOR, MATRIX, INDICES, PAIRS = 'f8[::1]', 'f8[:,::1]', 'i8[::1]', 'i8[:,::1]'  # in signatures
-BAND = 7  # entries of a column of the matrix: the diagonal and six below it
-CONTACT_COLUMNS = 24  # numbers that describe a contact, see `resolve`
-SKIN = 0.004  # m; pairs that near are watched until the nodes may have moved that far
+BAND = 7  # entries of a column of the matrix: node i couples to i + 2, three coordinates each
 
 
-def _compiled(signature: str) -> Callable[[Kernel], Kernel]:
+def _state(record: Any) -> Any:
+    """Let kernels take a named tuple whose fields have the types that its annotations say."""
+    make: Any = numba.types.NamedTuple
+    TYPES[record.__name__] = make([TYPES[word.__forward_arg__] for word in record.__annotations__.values()],
+                                  record)
+    return record
+
+
+# A field is taken out of its record before a loop, not in it: each time, Numba counts a reference.
+
+
+def _part(kernel: Kernel) -> Kernel:
+    """Compile as a part of the kernels that call it."""
+    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy')
+    return compile_(kernel)  # type: ignore[no-any-return]
+
+
+def _compiled(kernel: Kernel) -> Kernel:
     """Compile at import, or take it from the cache: a rollout never waits for the compiler."""
-    compile_: Any = numba.njit(signature, cache=True, nogil=True, error_model='numpy')
-    return compile_  # type: ignore[no-any-return]
+    *arguments, returned = (TYPES[word] for word in kernel.__annotations__.values())
+    compile_: Any = numba.njit(returned(*arguments), cache=True, nogil=True, error_model='numpy')
+    return compile_(kernel)  # type: ignore[no-any-return]
 
 
-@_compiled(f'boolean({MATRIX}, {VECTOR})')
-def _solve(bands: Floats, right: Floats) -> bool:
+@_state
+class Spans(NamedTuple):
+    """
+    The s parts of a DLO between two clamps.
+
+    :param segments: (s, 2) the first and the last, which the clamps hold.
+    :param stiffness: (s,) torque per angle [N m].
+    :param angle: (s,) of twist [rad].
+    :param begun: (s,) 1 where it has been stepped since the clamps closed, else 0.
+    :param tangents: (s, 2, 3) unit vectors along both segments when it began.
+    :param frames: (s, 2, 3) unit vectors across both segments when it began.
+    """
+
+    segments: IndexRows
+    stiffness: Vector
+    angle: Vector
+    begun: Indices
+    tangents: Cube
+    frames: Cube
+
+
+@_state
+class RodState(NamedTuple):
+    """
+    What the internal forces of N nodes follow from; see `rod.Rod`, which makes it.
+
+    :param rest_lengths: (N - 1,) [m] of the segments.
+    :param stiffness: (N - 1,) of each stretching spring [N/m].
+    :param masses: (N,) [kg].
+    :param inverse_masses: (N,) [1/kg], 0 for held nodes.
+    :param bending: (3, N) bending matrix [N/m]: its diagonal and the two below it.
+    :param natural: (N - 2,) [N m] EI times natural curvature at each inner node; (0,): straight at rest.
+    :param spans: what resists twist.
+    :param held: (h,) nodes that follow given velocities.
+    :param follow: (h, 3) [m/s] these velocities.
+    :param drag: [1/s].
+    :param implicit: c of the step [s^2].
+    :param step: [s].
+    :param bands: (3 N + 6, 7), workspace: columns of the lower triangle of the matrix.
+    :param right: (3 N + 6,), workspace: right side.
+    """
+
+    rest_lengths: Vector
+    stiffness: Vector
+    masses: Vector
+    inverse_masses: Vector
+    bending: Matrix
+    natural: Vector
+    spans: Spans
+    held: Indices
+    follow: Matrix
+    drag: float
+    implicit: float
+    step: float
+    bands: Matrix
+    right: Vector
+
+
+@_state
+class Contacts(NamedTuple):
+    """
+    Workspace: pairs of segments that touch each other, c at most.
+
+    :param nodes: (c, 4) the ends of the first and of the second segment.
+    :param weights: (c, 4) of the nodes' velocities in that of the closest points to each other.
+    :param yielding: (c, 4) inverse masses [1/kg] of the nodes, 0 where something supports them.
+    :param normals: (c, 3) unit vectors from the second to the first segment.
+    :param mobility: (c,) velocity per impulse [1/kg].
+    :param wanted: (c,) least velocity at which they part [m/s].
+    :param pushed: (c,) impulse along the normal until now [N s].
+    :param rubbed: (c, 3) impulse across it until now [N s].
+    :param impulse: (3,) [N s] of the contact under way.
+    """
+
+    nodes: IndexRows
+    weights: Matrix
+    yielding: Matrix
+    normals: Matrix
+    mobility: Vector
+    wanted: Vector
+    pushed: Vector
+    rubbed: Matrix
+    impulse: Vector
+
+
+@_state
+class SelfContact(NamedTuple):
+    """
+    Contact of S segments with each other: capsules that do not pass through each other.
+
+    Spheres at the nodes cannot do this for a thin DLO, whose nodes lie further apart than its
+    diameter.  Parts that are nearer along the DLO than half the circumference of its
+    cross-section cannot touch: that is how far apart the legs of the tightest hairpin are.
+    Pairs that are nearer than a diameter at the start keep that distance until they have
+    moved apart, so that a radius that is larger than the real one does not burst the DLO open.
+
+    :param half: (S,) [m] half the lengths of the segments.
+    :param middles: (S,) [m] where their middles are along the DLO.
+    :param diameter: [m].
+    :param apart: pairs that are nearer along the DLO cannot touch [m].
+    :param friction: Coulomb coefficient.
+    :param distances: (S, S) [m] that pairs keep.
+    :param pairs: (S (S - 1) / 2, 2), of which the first ones are near each other now.
+    :param near: (1,) how many.
+    :param room: (1,) how far nodes may move before others are [m]; less than 0: not known.
+    :param contacts: workspace.
+    :param change: (S + 1, 3), workspace.
+    """
+
+    half: Vector
+    middles: Vector
+    diameter: float
+    apart: float
+    friction: float
+    distances: Matrix
+    pairs: IndexRows
+    near: Indices
+    room: Vector
+    contacts: Contacts
+    change: Matrix
+
+
+@_state
+class RopeState(NamedTuple):
+    """
+    A DLO between two steps; see `rope.Rope`, which makes it.
+
+    :param points: (N, 3) [m].
+    :param velocities: (N, 3) [m/s].
+    :param wanted: (N, 3) [m/s] velocities that it would have but for other bodies.
+    :param support: (N, 3) [m/s] change of velocity that other bodies caused in the last step.
+    :param gravity: (3,) [m/s^2].
+    :param rod: its internal forces.
+    :param contact: with itself.
+    """
+
+    points: Matrix
+    velocities: Matrix
+    wanted: Matrix
+    support: Matrix
+    gravity: Vector
+    rod: RodState
+    contact: SelfContact
+
+
+@_part
+def _solve(bands: Matrix, right: Vector) -> bool:
     """
     Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 
@@ -84,8 +260,8 @@ def _solve(bands: Floats, right: Floats) -> bool:
     return math.isfinite(total)
 
 
-@_compiled(f'void({VECTOR}, {VECTOR}, {VECTOR})')
-def _carry(frame: Floats, before: Floats, tangent: Floats) -> None:
+@_part
+def _carry(frame: Vector, before: Vector, tangent: Vector) -> None:
     """Turn `frame` (3,), perpendicular to `before` (3,), by the smallest rotation to another tangent (3,)."""
     cosine = before[0] * tangent[0] + before[1] * tangent[1] + before[2] * tangent[2]
     along = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]
@@ -100,133 +276,33 @@ def _carry(frame: Floats, before: Floats, tangent: Floats) -> None:
         frame[c] /= size
 
 
-@_compiled(f'void({MATRIX}, {VECTOR}, f8, {VECTOR})')
-def add_natural(points: Floats, moments: Floats, step: float, right: Floats) -> None:
-    """Add to `right` (3 N,) the impulses [N s] of the natural curvature; see `natural.natural_forces`."""
-    n = len(points) - 1
-    # columns: tangent, frame, torque; then length, and of the joint at its end half, both bends
-    tangent, frame, torque, length, half, bend = 0, 3, 6, 9, 10, 11
-    segments = np.zeros((n, 13))
-    for i in range(n):
-        segment = segments[i]
-        for c in range(3):
-            segment[tangent + c] = points[i + 1, c] - points[i, c]
-        segment[length] = math.sqrt(segment[0]**2 + segment[1]**2 + segment[2]**2)
-        for c in range(3):
-            segment[tangent + c] /= segment[length]
-    start = segments[0]
-    least = 0
-    for c in range(1, 3):
-        if abs(start[c]) < abs(start[least]):
-            least = c
-    one, two = (least + 1) % 3, (least + 2) % 3
-    size = math.hypot(start[one], start[two])
-    start[frame + one], start[frame + two] = start[two] / size, -start[one] / size
-    total_x, total_y, total_moment = 0.0, 0.0, 0.0
-    for i in range(n - 1):
-        a, b = segments[i], segments[i + 1]
-        cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-        a[half] = math.sqrt(max((1.0 + cosine) / 2, HAIRPIN))
-        x = b[0] * a[3] + b[1] * a[4] + b[2] * a[5]
-        y = (b[0] * (a[1] * a[5] - a[2] * a[4]) + b[1] * (a[2] * a[3] - a[0] * a[5])
-             + b[2] * (a[0] * a[4] - a[1] * a[3]))
-        b[frame:frame + 3] = a[frame:frame + 3]
-        _carry(b[frame:frame + 3], a[:3], b[:3])
-        a[bend], a[bend + 1] = x / a[half], y / a[half]
-        total_x += moments[i] * a[bend]
-        total_y += moments[i] * a[bend + 1]
-        total_moment += moments[i]
-    size = math.sqrt(total_x**2 + total_y**2 + (ROUNDED * total_moment / (n - 1))**2)
-    total_x /= size
-    total_y /= size
-    for i in range(n):
-        a = segments[i]
-        x = total_x * a[3] + total_y * (a[1] * a[5] - a[2] * a[4])
-        y = total_x * a[4] + total_y * (a[2] * a[3] - a[0] * a[5])
-        z = total_x * a[5] + total_y * (a[0] * a[4] - a[1] * a[3])
-        a[3], a[4], a[5] = x, y, z
-    against_twist = 0.0
-    for i in range(n - 1):
-        a, b = segments[i], segments[i + 1]
-        both = (total_x * a[bend] + total_y * a[bend + 1]) / (4 * a[half]**2)
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            joint = moments[i] * (
-                (b[d] * a[frame + e] - b[e] * a[frame + d] + a[d] * b[frame + e] - a[e] * b[frame + d])
-                / (2 * a[half]) + both * (a[d] * b[e] - a[e] * b[d]))
-            b[torque + c] += joint
-            a[torque + c] -= joint
-        against_twist -= a[0] * a[6] + a[1] * a[7] + a[2] * a[8]
-        a[length + 3] = against_twist
-    for i in range(n - 1):
-        a, b = segments[i], segments[i + 1]
-        share = a[length + 3] / (2 * a[half]**2)
-        for c in range(3):
-            axis = share * (a[c] + b[c])
-            b[torque + c] -= axis
-            a[torque + c] += axis
-    for i in range(n):
-        a = segments[i]
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            impulse = step * (a[torque + d] * a[e] - a[torque + e] * a[d]) / a[length]
-            right[3 * i + 3 + c] += impulse
-            right[3 * i + c] -= impulse
-
-
-@_compiled(f'void({MATRIX}, {MATRIX}, f8, {VECTOR})')
-def add_twist(points: Floats, spans: Floats, step: float, right: Floats) -> None:
-    """Add to `right` (3 N,) the impulses [N s] of twist between clamps; see `twist.twist_forces`."""
-    n = len(points) - 1
-    tangents, torques = np.empty((n, 3)), np.zeros((n, 3))
-    lengths = np.empty(n)
-    for i in range(n):
+@_part
+def _along(points: Matrix, tangents: Matrix, lengths: Vector) -> None:
+    """Write the (n, 3) unit vectors along the segments and their (n,) lengths [m]."""
+    for i in range(len(lengths)):
         for c in range(3):
             tangents[i, c] = points[i + 1, c] - points[i, c]
         lengths[i] = math.sqrt(tangents[i, 0]**2 + tangents[i, 1]**2 + tangents[i, 2]**2)
         for c in range(3):
             tangents[i, c] /= lengths[i]
-    frame, there = np.empty(3), np.empty(3)
-    for k in range(len(spans)):
-        span = spans[k]
-        a, b = int(span[FIRST]), int(span[LAST])
-        if span[BEGUN] == 0.0:
-            span[START:START + 3] = tangents[a]
-            least = 0
-            for c in range(1, 3):
-                if abs(tangents[a, c]) < abs(tangents[a, least]):
-                    least = c
-            one, two = (least + 1) % 3, (least + 2) % 3
-            size = math.hypot(tangents[a, one], tangents[a, two])
-            span[START + 3 + one], span[START + 3 + two] = tangents[a, two] / size, -tangents[a, one] / size
-        frame[:] = span[START + 3:END]
-        _carry(frame, span[START:START + 3], tangents[a])
-        for i in range(a, b):
-            _carry(frame, tangents[i], tangents[i + 1])
-        if span[BEGUN] == 0.0:
-            span[BEGUN] = 1.0
-            span[END:END + 3] = tangents[b]
-            span[END + 3:COLUMNS] = frame
-        there[:] = span[END + 3:COLUMNS]
-        _carry(there, span[END:END + 3], tangents[b])
-        x, y = 0.0, 0.0
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            x += frame[c] * there[c]
-            y += tangents[b, c] * (frame[d] * there[e] - frame[e] * there[d])
-        angle = math.atan2(y, x)
-        angle += 2 * math.pi * round((span[ANGLE] - angle) / (2 * math.pi))
-        span[ANGLE] = angle
-        for i in range(a, b):
-            square = 0.0
-            for c in range(3):
-                square += (tangents[i, c] + tangents[i + 1, c])**2
-            share = span[STIFFNESS] * angle / max(square / 2, 2 * HAIRPIN)
-            for c in range(3):
-                joint = share * (tangents[i, c] + tangents[i + 1, c])
-                torques[i + 1, c] -= joint
-                torques[i, c] += joint
-    for i in range(n):
+
+
+@_part
+def _across(tangent: Vector, frame: Vector) -> None:
+    """Write to `frame` (3,) some unit vector perpendicular to a (3,) tangent."""
+    least = 0
+    for c in range(1, 3):
+        if abs(tangent[c]) < abs(tangent[least]):
+            least = c
+    one, two = (least + 1) % 3, (least + 2) % 3
+    size = math.hypot(tangent[one], tangent[two])
+    frame[least], frame[one], frame[two] = 0.0, tangent[two] / size, -tangent[one] / size
+
+
+@_part
+def _add_couples(torques: Matrix, tangents: Matrix, lengths: Vector, step: float, right: Vector) -> None:
+    """Add to `right` the impulses [N s] at the ends of segments that (n, 3) torques [N m] on them are."""
+    for i in range(len(lengths)):
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3
             impulse = step * (torques[i, d] * tangents[i, e] - torques[i, e] * tangents[i, d]) / lengths[i]
@@ -234,23 +310,149 @@ def add_twist(points: Floats, spans: Floats, step: float, right: Floats) -> None
             right[3 * i + c] -= impulse
 
 
-@_compiled(f'boolean({MATRIX}, {MATRIX}, {MATRIX}, {INDICES}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, {VECTOR}, {MATRIX}, f8, f8, f8, {MATRIX}, {VECTOR})')
-def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any, follow: Floats,
-                   rest: Floats, stiffness: Floats, masses: Floats, bending: Floats, natural: Floats,
-                   spans: Floats, drag: float, implicit: float, step: float, bands: Floats,
-                   right: Floats) -> bool:
+@_part
+def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> None:
     """
-    Put the velocities after one step into `wanted`; see `rod.Rod.velocities`.
+    Add to `right` (3 N,) the impulses [N s] of a DLO that is curved where nothing bends it.
 
-    Gravity is added by the caller, in `velocities`.
+    With natural curvature k the bending energy of inner node i is
+    ``EI / (2 l) |t_i - t_(i-1) - k l d_i|^2``, l the length it stands for, d_i the
+    direction of the curve that the DLO has at rest: a unit vector of a frame that goes
+    along the DLO without twist (Bishop, There is more than one way to frame a
+    curve, 1975; transported from segment to segment as in Bergou et al., Discrete
+    Elastic Rods, 2008, 4.2).  Multiplied out, the first part is that of a straight
+    DLO, the last is constant, and what remains is
 
-    :param natural: (N - 2,) [N m] as `rod.Rod.natural`; (0,): straight at rest.
-    :param spans: (s, COLUMNS) as `rod.Rod.spans`.
-    :param bands: (3 N + 6, 7), workspace.
-    :param right: (3 N + 6,), workspace.
+        -k EI g_i,    g_i = 2 sin(angle_i / 2) cos(angle from d_i to the plane of the bend)
+
+    The frame as a whole turns freely about the DLO to where its energy is least: a
+    DLO has next to no inertia about its axis, and how hands hold it does not
+    tell how it was coiled.  With a and b the sums of ``k EI g_i`` for two perpendicular
+    d, that is ``-sqrt(a^2 + b^2)``.  At a straight DLO that has a cusp, rounded off by
+    `ROUNDED`.
+
+    The forces are its exact slope.  A segment can turn about its axis without
+    inertia, so that the torque of its two joints about that axis vanishes, with the
+    moment that the joints need against twist; the rest of the torque is a couple of
+    forces at its ends.
+
+    :param moments: (N - 2,) [N m] EI times natural curvature at each inner node.
+    """
+    n = len(points) - 1
+    tangents, frames, torques = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
+    lengths, halves, bends = np.empty(n), np.empty(n), np.empty((n, 2))  # two of them at the end of each
+    _along(points, tangents, lengths)
+    _across(tangents[0], frames[0])
+    total_x, total_y, total_moment = 0.0, 0.0, 0.0
+    for i in range(n - 1):
+        a, b, frame = tangents[i], tangents[i + 1], frames[i]
+        cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        halves[i] = math.sqrt(max((1.0 + cosine) / 2, HAIRPIN))
+        x = b[0] * frame[0] + b[1] * frame[1] + b[2] * frame[2]
+        y = (b[0] * (a[1] * frame[2] - a[2] * frame[1]) + b[1] * (a[2] * frame[0] - a[0] * frame[2])
+             + b[2] * (a[0] * frame[1] - a[1] * frame[0]))
+        frames[i + 1] = frame
+        _carry(frames[i + 1], a, b)
+        bends[i, 0], bends[i, 1] = x / halves[i], y / halves[i]
+        total_x += moments[i] * bends[i, 0]
+        total_y += moments[i] * bends[i, 1]
+        total_moment += moments[i]
+    size = math.sqrt(total_x**2 + total_y**2 + (ROUNDED * total_moment / (n - 1))**2)
+    total_x /= size
+    total_y /= size
+    for i in range(n):
+        a, frame = tangents[i], frames[i]
+        x = total_x * frame[0] + total_y * (a[1] * frame[2] - a[2] * frame[1])
+        y = total_x * frame[1] + total_y * (a[2] * frame[0] - a[0] * frame[2])
+        z = total_x * frame[2] + total_y * (a[0] * frame[1] - a[1] * frame[0])
+        frame[0], frame[1], frame[2] = x, y, z
+    against_twist = np.empty(n)
+    sum_ = 0.0
+    for i in range(n - 1):
+        a, b = tangents[i], tangents[i + 1]
+        both = (total_x * bends[i, 0] + total_y * bends[i, 1]) / (4 * halves[i]**2)
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            joint = moments[i] * (
+                (b[d] * frames[i, e] - b[e] * frames[i, d]
+                 + a[d] * frames[i + 1, e] - a[e] * frames[i + 1, d]) / (2 * halves[i]) + both * (a[d] * b[e] - a[e] * b[d]))
+            torques[i + 1, c] += joint
+            torques[i, c] -= joint
+        sum_ -= a[0] * torques[i, 0] + a[1] * torques[i, 1] + a[2] * torques[i, 2]
+        against_twist[i] = sum_
+    for i in range(n - 1):
+        share = against_twist[i] / (2 * halves[i]**2)
+        for c in range(3):
+            axis = share * (tangents[i, c] + tangents[i + 1, c])
+            torques[i + 1, c] -= axis
+            torques[i, c] += axis
+    _add_couples(torques, tangents, lengths, step, right)
+
+
+@_part
+def add_twist(points: Matrix, spans: Spans, step: float, right: Vector) -> None:
+    """
+    Add to `right` (3 N,) the impulses [N s] of twist between clamps; bring `spans` up to date.
+
+    A DLO has next to no inertia about its axis, so that twist is the same all along,
+    between two clamps, whenever its stiffness is; the energy is ``c / 2 angle^2`` (Bergou et al., Discrete
+    Elastic Rods, 2008, 4.2.2).  The angle is that from a frame carried from the first clamp to the
+    second along the DLO without twist to the frame that the second clamp holds.  It is
+    zero when both are closed.  How a clamp turns about the DLO's axis is not known, only its
+    direction: it turns by the smallest rotation from that when it closed.
+
+    The forces are the exact slope: a torque of the same size about every joint, of
+    which the segments pass on as a couple what is across them.
+    """
+    n = len(points) - 1
+    tangents, torques, lengths = np.empty((n, 3)), np.zeros((n, 3)), np.empty(n)
+    _along(points, tangents, lengths)
+    frame, there = np.empty(3), np.empty(3)
+    for k in range(len(spans.segments)):
+        a, b = spans.segments[k, 0], spans.segments[k, 1]
+        if spans.begun[k] == 0:
+            spans.tangents[k, 0] = tangents[a]
+            _across(tangents[a], spans.frames[k, 0])
+        frame[:] = spans.frames[k, 0]
+        _carry(frame, spans.tangents[k, 0], tangents[a])
+        for i in range(a, b):
+            _carry(frame, tangents[i], tangents[i + 1])
+        if spans.begun[k] == 0:
+            spans.begun[k] = 1
+            spans.tangents[k, 1] = tangents[b]
+            spans.frames[k, 1] = frame
+        there[:] = spans.frames[k, 1]
+        _carry(there, spans.tangents[k, 1], tangents[b])
+        x, y = 0.0, 0.0
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            x += frame[c] * there[c]
+            y += tangents[b, c] * (frame[d] * there[e] - frame[e] * there[d])
+        angle = math.atan2(y, x)
+        angle += 2 * math.pi * round((spans.angle[k] - angle) / (2 * math.pi))
+        spans.angle[k] = angle
+        for i in range(a, b):
+            square = 0.0
+            for c in range(3):
+                square += (tangents[i, c] + tangents[i + 1, c])**2
+            share = spans.stiffness[k] * angle / max(square / 2, 2 * HAIRPIN)
+            for c in range(3):
+                joint = share * (tangents[i, c] + tangents[i + 1, c])
+                torques[i + 1, c] -= joint
+                torques[i, c] += joint
+    _add_couples(torques, tangents, lengths, step, right)
+
+
+@_part
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, wanted: Matrix) -> bool:
+    """
+    Put the velocities (N, 3) [m/s] after one step of the internal forces into `wanted`; see `rod`.
+
     :returns: False where the rollout diverges.
     """
+    rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
+    held, follow, bands, right = rod.held, rod.follow, rod.bands, rod.right
+    drag, implicit, step = rod.drag, rod.implicit, rod.step
     n = len(points)
     size = 3 * n
     for j in range(size):
@@ -310,10 +512,10 @@ def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any
         bands[j + 2, 1] -= xz
         bands[j + 2, 2] -= yz
         bands[j + 2, 3] -= zz
-    if len(natural) > 0:
-        add_natural(points, natural, step, right)
-    if len(spans) > 0:
-        add_twist(points, spans, step, right)
+    if len(rod.natural) > 0:
+        add_natural(points, rod.natural, step, right)
+    if len(rod.spans.segments) > 0:
+        add_twist(points, rod.spans, step, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
         for c in range(3):
@@ -331,9 +533,14 @@ def rod_velocities(points: Floats, velocities: Floats, wanted: Floats, held: Any
     return True
 
 
-@_compiled(f'UniTuple(f8, 6)({MATRIX}, i8, i8)')
-def _closest(points: Floats, first: int, second: int) -> tuple[float, float, float, float, float, float]:
-    """Return s, t, the normal and the distance of two segments; see `contact`."""
+@_part
+def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
+    """
+    Return where two segments are nearest: Ericson, Real-Time Collision Detection, 5.1.9.
+
+    :returns: s and t, 0..1, the places on the first and on the second segment; the unit normal
+        from the second to the first; the distance [m].
+    """
     p0, p1, p2 = points[first, 0], points[first, 1], points[first, 2]
     q0, q1, q2 = points[second, 0], points[second, 1], points[second, 2]
     u0, u1, u2 = points[first + 1, 0] - p0, points[first + 1, 1] - p1, points[first + 1, 2] - p2
@@ -361,19 +568,16 @@ def _closest(points: Floats, first: int, second: int) -> tuple[float, float, flo
     return s, clipped, 0.0, 0.0, 1.0, distance
 
 
-@_compiled(f'i8({MATRIX}, {VECTOR}, {VECTOR}, f8, f8, f8, f8, {PAIRS})')
-def near_pairs(points: Floats, middles: Floats, half: Floats, apart: float, diameter: float, stretch: float,
-               reach: float, pairs: Any) -> int:
+@_part
+def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
     """
-    List the pairs of segments that may touch each other and are nearer than `reach` [m].
+    List in `contact.pairs` the pairs of segments that may touch each other and are nearer than `reach` [m].
 
-    :param middles: (S,) [m] of the segments along the DLO; `half` (S,) [m] half their lengths.
-    :param apart: pairs that are nearer along the DLO cannot touch [m].
     :param stretch: how much longer than at rest a segment may be.
-    :param pairs: (S (S - 1) / 2, 2) to write to.
     :returns: how many there are.
     """
-    count, segments = 0, len(half)
+    half, middles, pairs, diameter = contact.half, contact.middles, contact.pairs, contact.diameter
+    apart, count, segments = contact.apart, 0, len(half)
     x, y, z = np.empty(segments), np.empty(segments), np.empty(segments)
     for i in range(segments):
         x[i] = (points[i, 0] + points[i + 1, 0]) / 2
@@ -393,33 +597,25 @@ def near_pairs(points: Floats, middles: Floats, half: Floats, apart: float, diam
     return count
 
 
-@_compiled(f'void({MATRIX}, {VECTOR}, {VECTOR}, f8, f8, {PAIRS}, {MATRIX})')
-def start_distances(points: Floats, middles: Floats, half: Floats, apart: float, diameter: float, pairs: Any,
-                    distances: Floats) -> None:
-    """Fill (S, S) `distances` [m] that pairs must keep; see `contact.SelfContact.start`."""
+@_compiled
+def start_distances(contact: SelfContact, points: Matrix) -> None:
+    """Take the (N, 3) [m] points at the start, where nothing may be kicked apart."""
+    distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
     distances[:] = diameter
-    for k in range(near_pairs(points, middles, half, apart, diameter, 1.0, 0.0, pairs)):
+    for k in range(near_pairs(contact, points, 1.0, 0.0)):
         i, j = pairs[k, 0], pairs[k, 1]
         distances[i, j] = min(diameter, _closest(points, i, j)[5])
+    contact.room[0] = -1.0
 
 
-@_compiled(f'void({MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {PAIRS}, {MATRIX}, f8, f8, f8, {MATRIX}, {MATRIX})')
-def resolve(points: Floats, velocities: Floats, inverse_masses: Floats, support: Floats, pairs: Any,
-            distances: Floats, diameter: float, friction: float, step: float, contacts: Floats,
-            change: Floats) -> None:
-    """
-    Make `velocities` what the contacts between pairs of segments allow; see `contact.SelfContact`.
-
-    :param pairs: (c, 2) segments that are near each other.
-    :param distances: (S, S) [m] that pairs keep.
-    :param contacts: (c, CONTACT_COLUMNS), workspace: see the names below.
-    :param change: (N, 3), workspace.
-    """
-    # columns of contacts: four nodes, weights, yieldings; normal, mobility, target, pushed, rubbed, impulse
-    node, weight, yielding, normal = 0, 4, 8, 12
-    mobility, target, pushed, rubbed, impulse = 15, 16, 17, 18, 21
+@_part
+def _touching(contact: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
+    """Fill in which of the first `near` pairs would come too near within a step; return how many."""
+    distances, diameter, pairs, contacts = (
+        contact.distances, contact.diameter, contact.pairs, contact.contacts)
+    nodes, weights, normals, least = contacts.nodes, contacts.weights, contacts.normals, contacts.wanted
     count = 0
-    for k in range(len(pairs)):
+    for k in range(near):
         i, j = pairs[k, 0], pairs[k, 1]
         s, t, n0, n1, n2, distance = _closest(points, i, j)
         allowed = max(distances[i, j], min(distance, diameter))
@@ -427,91 +623,144 @@ def resolve(points: Floats, velocities: Floats, inverse_masses: Floats, support:
         gap = distance - allowed
         wanted = -gap / step if gap > 0 else min(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT)
         approach = 0.0
-        contact = contacts[count]
-        contact[normal], contact[normal + 1], contact[normal + 2] = n0, n1, n2
-        contact[node], contact[node + 1], contact[node + 2], contact[node + 3] = i, i + 1, j, j + 1
-        contact[weight], contact[weight + 1] = 1 - s, s
-        contact[weight + 2], contact[weight + 3] = -(1 - t), -t
+        normals[count, 0], normals[count, 1], normals[count, 2] = n0, n1, n2
+        nodes[count, 0], nodes[count, 1], nodes[count, 2], nodes[count, 3] = i, i + 1, j, j + 1
+        weights[count, 0], weights[count, 1] = 1 - s, s
+        weights[count, 2], weights[count, 3] = -(1 - t), -t
         for m in range(4):
-            at = int(contact[node + m])
-            approach += contact[weight + m] * (
+            at = nodes[count, m]
+            approach += weights[count, m] * (
                 velocities[at, 0] * n0 + velocities[at, 1] * n1 + velocities[at, 2] * n2)
         if approach < wanted:
-            contact[target] = wanted
+            least[count] = wanted
             count += 1
-    if count == 0:
-        return
+    return count
+
+
+@_part
+def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Matrix, change: Matrix) -> None:
+    """
+    Fill in which nodes of the first `count` contacts yield, and how much.
+
+    A node does not yield to a push against what supports it (a strand on a table carries another
+    one), but passes the push on to that body.
+    """
+    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
+    mobility, pushed, rubbed = contacts.mobility, contacts.pushed, contacts.rubbed
     change[:] = 0.0
     for k in range(count):
         for m in range(4):
-            change[int(contacts[k, node + m]), 0] += 1.0  # how many contacts share the node
+            change[nodes[k, m], 0] += 1.0  # how many contacts share the node
     for k in range(count):
-        contact = contacts[k]
         given, full, shared = 0.0, 0.0, 0.0
         for m in range(4):
-            at = int(contact[node + m])
-            w = contact[weight + m]
+            at, w = nodes[k, m], weights[k, m]
             backing, size = 0.0, 0.0
             for c in range(3):
-                backing += support[at, c] * contact[normal + c]
+                backing += support[at, c] * normals[k, c]
                 size += support[at, c] * support[at, c]
             if w < 0:
                 backing = -backing
             elif w == 0:
                 backing = 0.0
             resistance = max(SUPPORTED * math.sqrt(size), UNSUPPORTED)
-            contact[yielding + m] = inverse_masses[at] if backing > -resistance else 0.0
-            given += w * w * contact[yielding + m]
+            yielding[k, m] = inverse_masses[at] if backing > -resistance else 0.0
+            given += w * w * yielding[k, m]
             full += w * w * inverse_masses[at]
         for m in range(4):
-            at = int(contact[node + m])
+            at = nodes[k, m]
             if given < WEDGED * full:
-                contact[yielding + m] = inverse_masses[at]
-            shared += contact[weight + m]**2 * contact[yielding + m] * change[at, 0]
-        contact[mobility] = shared if shared > 0 else math.inf  # both held
-        contact[pushed] = 0.0
-        contact[rubbed:rubbed + 3] = 0.0
-    for _ in range(ITERATIONS):
-        change[:] = 0.0
-        for k in range(count):
-            contact = contacts[k]
-            approach, size = 0.0, 0.0
-            for c in range(3):
-                relative = 0.0
-                for m in range(4):
-                    relative += contact[weight + m] * velocities[int(contact[node + m]), c]
-                contact[impulse + c] = relative
-                approach += relative * contact[normal + c]
-            push = max(contact[pushed] + (contact[target] - approach) / contact[mobility], 0.0)
-            for c in range(3):
-                contact[impulse + c] = contact[rubbed + c] - (
-                    contact[impulse + c] - approach * contact[normal + c]) / contact[mobility]
-                size += contact[impulse + c]**2
-            share = min(1.0, friction * push / max(math.sqrt(size), TINY))
-            for c in range(3):
-                rub = share * contact[impulse + c]
-                contact[impulse + c] = rub - contact[rubbed + c] + (
-                    push - contact[pushed]) * contact[normal + c]
-                contact[rubbed + c] = rub
-            contact[pushed] = push
-            for m in range(4):
-                at = int(contact[node + m])
-                factor = contact[weight + m] * contact[yielding + m]
-                for c in range(3):
-                    change[at, c] += factor * contact[impulse + c]
-        velocities += change
+                yielding[k, m] = inverse_masses[at]
+            shared += weights[k, m]**2 * yielding[k, m] * change[at, 0]
+        mobility[k] = shared if shared > 0 else math.inf  # both held
+        pushed[k] = 0.0
+        for c in range(3):
+            rubbed[k, c] = 0.0
+
+
+@_part
+def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Matrix, change: Matrix) -> None:
+    """Make one iteration over the first `count` contacts, with Coulomb friction."""
+    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
+    mobility, wanted, pushed, rubbed, impulse = (
+        contacts.mobility, contacts.wanted, contacts.pushed, contacts.rubbed, contacts.impulse)
+    change[:] = 0.0
     for k in range(count):
-        contact = contacts[k]
+        approach, size = 0.0, 0.0
+        for c in range(3):
+            relative = 0.0
+            for m in range(4):
+                relative += weights[k, m] * velocities[nodes[k, m], c]
+            impulse[c] = relative
+            approach += relative * normals[k, c]
+        push = max(pushed[k] + (wanted[k] - approach) / mobility[k], 0.0)
+        for c in range(3):
+            impulse[c] = rubbed[k, c] - (impulse[c] - approach * normals[k, c]) / mobility[k]
+            size += impulse[c]**2
+        share = min(1.0, friction * push / max(math.sqrt(size), TINY))
+        for c in range(3):
+            rub = share * impulse[c]
+            impulse[c] = rub - rubbed[k, c] + (push - pushed[k]) * normals[k, c]
+            rubbed[k, c] = rub
+        pushed[k] = push
         for m in range(4):
-            at = int(contact[node + m])
-            passed_on = contact[weight + m] * (inverse_masses[at] - contact[yielding + m])
+            factor = weights[k, m] * yielding[k, m]
             for c in range(3):
-                velocities[at, c] += passed_on * (
-                    contact[pushed] * contact[normal + c] + contact[rubbed + c])
+                change[nodes[k, m], c] += factor * impulse[c]
+    velocities += change
 
 
-@_compiled(f'void({MATRIX}, {MATRIX}, f8, f8, f8)')
-def rest_on_table(points: Floats, velocities: Floats, level: float, friction: float, step: float) -> None:
+@_part
+def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities: Matrix) -> None:
+    """Let the nodes that did not yield pass the impulses on to what supports them."""
+    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
+    pushed, rubbed = contacts.pushed, contacts.rubbed
+    for k in range(count):
+        for m in range(4):
+            at = nodes[k, m]
+            passed_on = weights[k, m] * (inverse_masses[at] - yielding[k, m])
+            for c in range(3):
+                velocities[at, c] += passed_on * (pushed[k] * normals[k, c] + rubbed[k, c])
+
+
+@_part
+def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector,
+               support: Matrix, step: float) -> None:
+    """
+    Make `velocities` what the contacts between pairs of segments allow.
+
+    They are velocity constraints, solved by Jacobi iterations with mass splitting (Tonge et al., Mass
+    Splitting for Jitter-Free Parallel Rigid Body Simulation, 2012).
+
+    :param points: (N, 3) [m] now.
+    :param velocities: (N, 3) [m/s] that the DLO would have without contacts.
+    :param inverse_masses: (N,) [1/kg], 0 for held nodes.
+    :param support: (N, 3) [m/s] change of velocity that other bodies last caused.
+    :param step: [s].
+    """
+    fastest = 0.0
+    for i in range(len(points)):
+        fastest = max(fastest, velocities[i, 0]**2 + velocities[i, 1]**2 + velocities[i, 2]**2)
+    travel = 2 * step * math.sqrt(fastest)
+    room, near = contact.room, contact.near
+    room[0] -= travel
+    if room[0] < 0:
+        near[0] = near_pairs(contact, points, STRETCH, travel + SKIN)
+        room[0] = SKIN
+    if near[0] == 0:
+        return
+    count = _touching(contact, near[0], points, velocities, step)
+    if count == 0:
+        return
+    contacts, change = contact.contacts, contact.change
+    _prepare(contacts, count, inverse_masses, support, change)
+    for _ in range(ITERATIONS):
+        _push_apart(contacts, count, contact.friction, velocities, change)
+    _pass_on(contacts, count, inverse_masses, velocities)
+
+
+@_part
+def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: float, step: float) -> None:
     """
     Make `velocities` what a table allows, with Coulomb friction, as Bullet does.
 
@@ -533,55 +782,58 @@ def rest_on_table(points: Floats, velocities: Floats, level: float, friction: fl
         velocities[i, 1] *= share
 
 
-@_compiled(f'i8(f8[:,:,::1], {INDICES}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR},'
-           f' {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}, {PAIRS}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX},'
-           f' {MATRIX}, {VECTOR}, f8[:,:,::1])')
-def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, support: Floats, rest: Floats,
-            stiffness: Floats, masses: Floats, inverse_masses: Floats, bending: Floats, natural: Floats,
-            spans: Floats, distances: Floats, pairs: Any, contacts: Floats, bands: Floats, right: Floats,
-            wanted: Floats, change: Floats, constants: Floats, path: Floats) -> int:
+@_part
+def _want(rope: RopeState, rod: RodState, contact: SelfContact, targets: Matrix) -> bool:
+    """Do what `want` says, with what is within the rope taken out of it."""
+    points, velocities, wanted, gravity = rope.points, rope.velocities, rope.wanted, rope.gravity
+    held, follow, step = rod.held, rod.follow, rod.step
+    for h in range(len(held)):
+        for c in range(3):
+            follow[h, c] = (targets[h, c] - points[held[h], c]) / step
+    for i in range(len(points)):
+        for c in range(3):
+            velocities[i, c] += step * gravity[c]
+    if not rod_velocities(rod, points, velocities, wanted):
+        return False
+    keep_apart(contact, points, wanted, rod.inverse_masses, rope.support, step)
+    return True
+
+
+@_compiled
+def want(rope: RopeState, targets: Matrix) -> bool:
     """
-    Take k steps; what is not explained here is the state, see `compiled.CompiledRope`.
+    Put into `rope.wanted` the velocities that gravity, the internal forces and self-contact give.
+
+    :param targets: (h, 3) [m] where the held nodes are after the step.
+    :returns: False where the rollout diverges.
+    """
+    return _want(rope, rope.rod, rope.contact, targets)
+
+
+@_compiled
+def advance(rope: RopeState, targets: Cube, level: float, path: Cube) -> int:
+    """
+    Take k steps on a table.
 
     :param targets: (k, h, 3) [m] where the held nodes are after each step.
+    :param level: height of nodes that touch the table [m].
     :param path: (k, N, 3) to write where all nodes are after each step [m]; or empty.
     :returns: how many steps were taken; fewer than k where the rollout diverged.
     """
-    drag, implicit, step, gravity = constants[0], constants[1], constants[2], constants[3]
-    level, friction, diameter, apart = constants[4], constants[5], constants[6], constants[7]
-    n = len(points)
-    places = rest.cumsum()
-    half = rest / 2
-    middles = places - half
-    follow = np.empty((len(held), 3))
+    rod, contact = rope.rod, rope.contact
+    points, velocities, wanted, support = rope.points, rope.velocities, rope.wanted, rope.support
+    held, follow, step, friction = rod.held, rod.follow, rod.step, contact.friction
     for k in range(len(targets)):
-        for h in range(len(held)):
-            for c in range(3):
-                follow[h, c] = (targets[k, h, c] - points[held[h], c]) / step
-        for i in range(n):
-            velocities[i, 2] -= step * gravity
-        if not rod_velocities(points, velocities, wanted, held, follow, rest, stiffness, masses, bending,
-                              natural, spans, drag, implicit, step, bands, right):
+        if not _want(rope, rod, contact, targets[k]):
             return k
-        fastest = 0.0
-        for i in range(n):
-            fastest = max(fastest, wanted[i, 0]**2 + wanted[i, 1]**2 + wanted[i, 2]**2)
-        travel = 2 * step * math.sqrt(fastest)
-        constants[8] -= travel
-        if constants[8] < 0:
-            constants[9] = near_pairs(points, middles, half, apart, diameter, 1.2, travel + SKIN, pairs)
-            constants[8] = SKIN
-        if constants[9] > 0:
-            resolve(points, wanted, inverse_masses, support, pairs[:int(constants[9])], distances, diameter,
-                    friction, step, contacts, change)
-        for i in range(n):
+        for i in range(len(points)):
             for c in range(3):
                 velocities[i, c] = wanted[i, c]
         rest_on_table(points, velocities, level, friction, step)
         for h in range(len(held)):
             for c in range(3):
                 velocities[held[h], c] = follow[h, c]
-        for i in range(n):
+        for i in range(len(points)):
             for c in range(3):
                 support[i, c] = velocities[i, c] - wanted[i, c]
                 points[i, c] += step * velocities[i, c]
@@ -589,5 +841,7 @@ def advance(targets: Floats, held: Any, points: Floats, velocities: Floats, supp
             for c in range(3):
                 points[held[h], c] = targets[k, h, c]
         if len(path) > 0:
-            path[k] = points
+            for i in range(len(points)):
+                for c in range(3):
+                    path[k, i, c] = points[i, c]
     return len(targets)

@@ -20,33 +20,24 @@ not (at 0.5 the stiffest modes would ring for ever): the damping is then less th
 time step's.  The part of the stretching matrix that a compressed spring makes
 negative is left out, so that the matrix stays positive definite.
 
-A DLO with natural curvature: see `natural`; one that resists twist: see `twist`.
-Parts of different stiffness: an inner node has that of the pieces on its two sides
-in series.
+The step itself, with what natural curvature and twist add, is in `kernels`; here is what it
+works on.  Parts of different stiffness: an inner node has that of the pieces on its two
+sides in series.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
-from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import PART_NAMES
-from dlo_calibration.simulation.natural import natural_forces
-from dlo_calibration.simulation.twist import COLUMNS, spans_between, twist_forces
+from dlo_calibration.simulation.kernels import BAND, RodState, Spans
 
-Indices = NDArray[np.intp]
-
-BANDS = 7  # diagonal and six below it: node i couples to i + 2, three coordinates each
 IMPLICIT = 0.6  # see the module
-TINY = 1e-12
-HELD = 1e12  # a held node's share of the matrix, relative to its mass
 
 
 @dataclass(frozen=True)
@@ -96,7 +87,7 @@ class RodProperties:
 
 class Rod:
     """
-    A chain of N nodes whose velocities are stepped by its internal forces and gravity.
+    A chain of N nodes, with the `state` that the kernels step.
 
     :param rest_lengths: (N - 1,) [m] of the segments as observed; they need not be equal.
     :param properties: see `RodProperties`.
@@ -108,27 +99,21 @@ class Rod:
                  features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
         rest_lengths = rest_lengths * properties.length_scale
-        #: (N - 1,) [m]
-        self.rest_lengths = rest_lengths
-        self._step = time_step
-        #: (N - 1,) of each stretching spring [N/m]
-        self.stiffness = properties.stretching_stiffness / rest_lengths
         weights = np.zeros(n)
         weights[:-1] += rest_lengths / 2
         weights[1:] += rest_lengths / 2
-        #: (N,) mass of each node [kg]
-        self.masses = properties.mass * weights / weights.sum()
+        masses = properties.mass * weights / weights.sum()
         if features is not None:
-            self.masses += properties.marker_mass * features
-        #: [1/s]
-        self.drag = properties.drag
-        self._bending_stiffness = properties.bending_stiffness
-        self._natural_curvature = properties.natural_curvature
-        self._torsion = properties.torsion
-        self._profile = np.array(properties.profile)
-        #: c of the step [s^2], see the module
-        self.implicit = time_step * max(properties.internal_damping, IMPLICIT * time_step)
-        self.spans = np.zeros((0, COLUMNS))
+            masses += properties.marker_mass * features
+        self._properties = properties
+        self.state = RodState(
+            rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
+            masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), natural=np.zeros(0),
+            spans=_untwisted((), ()), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
+            drag=float(properties.drag),
+            implicit=float(time_step * max(properties.internal_damping, IMPLICIT * time_step)),
+            step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
+            right=np.empty(3 * n + BAND - 1))
         self.hold(())
 
     def hold(self, nodes: Sequence[int]) -> None:
@@ -138,84 +123,33 @@ class Rod:
         A segment between two held nodes is rigid, so that the bending begins
         at its end: exactly there a clamped DLO leaves its clamp.
         """
-        self._held = np.array(sorted(nodes), int)
-        self._pull = HELD * self.masses[self._held]
-        held = np.zeros(len(self.masses), bool)
-        held[self._held] = True
-        rigid = held[:-1] & held[1:]
-        #: (3, N) bending matrix [N/m]: its diagonal and the two below it
+        state, properties = self.state, self._properties
+        held = np.array(nodes, np.int64)
+        follows = np.isin(np.arange(len(state.masses)), held)
+        rigid = follows[:-1] & follows[1:]
         stiffnesses = self._stiffnesses(rigid)
-        self.bending = _bending_bands(self.rest_lengths, rigid, stiffnesses)
-        #: (N - 2,) [N m] that would straighten each inner node; (0,) of a DLO that is straight at rest
-        self.natural: Floats = np.zeros(0)
-        if self._natural_curvature and not rigid.all():
-            self.natural = self._natural_curvature * np.where(rigid[:-1] & rigid[1:], 0.0, stiffnesses)
-        #: what twists between clamps, see `twist`; empty of a DLO that does not resist twist
-        compliances = self._compliances(rigid, stiffnesses)
-        self.spans = spans_between(rigid & (self._torsion > 0), compliances, self.spans)
-        self._constant: Floats | None = None
-
-    @property
-    def held(self) -> Indices:
-        """Indices of the held nodes."""
-        return self._held
-
-    def velocities(self, points: Floats, velocities: Floats, gravity: Floats,
-                   held_velocities: Floats) -> Floats:
-        """
-        Return the velocities (N, 3) [m/s] after one time step without contacts.
-
-        :param points: (N, 3) [m] now.
-        :param velocities: (N, 3) [m/s] now.
-        :param gravity: (3,) [m/s^2].
-        :param held_velocities: (h, 3) [m/s] of the held nodes, in the order of `held`.
-        :raises SimulationError: where the points are no longer finite.
-        """
-        step = self._step
-        segments = points[1:] - points[:-1]
-        squares = np.einsum('ij,ij->i', segments, segments)
-        lengths = np.sqrt(squares)
-        slack = (1 - self.rest_lengths / lengths)[:, None]
-        tensions = self.stiffness[:, None] * slack * segments
-        forces = -self._bend(points)
-        if len(self.natural):
-            forces += natural_forces(segments, lengths, self.natural)
-        if len(self.spans):
-            forces += twist_forces(segments, lengths, self.spans)
-        forces[:-1] += tensions
-        forces[1:] -= tensions
-        right = self.masses[:, None] * (velocities + step * gravity) + step * forces
-
-        across = np.maximum(slack, 0) * self.stiffness[:, None]
-        along = (self.stiffness[:, None] - across) / squares[:, None]
-        blocks = (along * segments)[:, :, None] * segments[:, None, :]
-        blocks[:, (0, 1, 2), (0, 1, 2)] += across
-        blocks *= self.implicit
-        diagonal = np.zeros((len(points), 3, 3))
-        diagonal[:-1] = blocks
-        diagonal[1:] += blocks
-        if self._constant is None:
-            self._constant = self._constant_bands()
-        bands = self._constant.copy()
-        places, signs = _stretching_places(len(points))
-        bands.reshape(-1)[places] += signs * np.concatenate(
-            [diagonal[:, _ROWS, _COLUMNS].ravel(), blocks.ravel()])
-        bands[0, self._held] += self._pull[:, None]
-        right[self._held] += self._pull[:, None] * held_velocities
-        _, solution, info = lapack.dpbsv(bands.reshape(BANDS, -1), right.ravel(), lower=1,
-                                         overwrite_ab=1, overwrite_b=1)
-        if info != 0 or not np.isfinite(solution).all():
-            raise SimulationError('the rollout diverged: the chain is no longer finite')
-        return np.asarray(solution).reshape(-1, 3)
+        natural: Floats = np.zeros(0)
+        if properties.natural_curvature and not rigid.all():
+            natural = properties.natural_curvature * np.where(rigid[:-1] & rigid[1:], 0.0, stiffnesses)
+        spans = state.spans
+        if properties.torsion > 0:
+            bendable = np.where(rigid, 0.0, state.rest_lengths)
+            compliances = (bendable[:-1] + bendable[1:]) / (2 * properties.torsion * stiffnesses)
+            spans = _spans_between(rigid, compliances, spans)
+        self.state = state._replace(
+            held=held, follow=np.zeros((len(held), 3)), natural=natural, spans=spans,
+            inverse_masses=np.where(follows, 0.0, 1 / state.masses),
+            bending=_bending_bands(state.rest_lengths, rigid, stiffnesses))
 
     def _stiffnesses(self, rigid: NDArray[np.bool_]) -> Floats:
         """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
-        stiffness: Floats = np.full(len(self.rest_lengths) - 1, self._bending_stiffness)
-        if (self._profile == 1).all():
+        lengths, profile = self.state.rest_lengths, np.array(self._properties.profile)
+        stiffness: Floats = np.full(len(lengths) - 1, self._properties.bending_stiffness)
+        if (profile == 1).all():
             return stiffness
-        ends = np.concatenate([[0.0], np.cumsum(self.rest_lengths)])
-        bounds = np.linspace(0, ends[-1], len(self._profile) + 1)
-        flexibility = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / self._profile)])  # up to each bound
+        ends = np.concatenate([[0.0], np.cumsum(lengths)])
+        bounds = np.linspace(0, ends[-1], len(profile) + 1)
+        flexibility = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / profile)])  # up to each bound
 
         def between(a: Floats, b: Floats) -> Floats:
             here, there = (np.interp(place, bounds, flexibility) for place in (a, b))
@@ -223,39 +157,38 @@ class Rod:
             return share
 
         middles = (ends[:-1] + ends[1:]) / 2
-        bendable = np.where(rigid, 0.0, self.rest_lengths / 2)
+        bendable = np.where(rigid, 0.0, lengths / 2)
         total = np.where(rigid[:-1], 0.0, between(middles[:-1], ends[1:-1])) + np.where(
             rigid[1:], 0.0, between(ends[1:-1], middles[1:]))
         cells = bendable[:-1] + bendable[1:]
         stiffness *= np.divide(cells, total, out=np.ones_like(total), where=total > 0)
         return stiffness
 
-    def _compliances(self, rigid: NDArray[np.bool_], stiffnesses: Floats) -> Floats:
-        """Return the angle per torque of twist at each inner node, (N - 2,) [1/(N m)]."""
-        bendable = np.where(rigid, 0.0, self.rest_lengths)
-        compliances: Floats = (bendable[:-1] + bendable[1:]) / (2 * max(self._torsion, TINY) * stiffnesses)
-        return compliances
 
-    def _constant_bands(self) -> Floats:
-        """Return the part of the matrix that stays the same until other nodes are held, (BANDS, N, 3)."""
-        bands = np.zeros((BANDS, len(self.masses), 3))
-        bands[0] = (self.masses * (1 + self.drag * self._step))[:, None]
-        for offset in range(3):
-            bands[3 * offset] += self.implicit * self.bending[offset][:, None]
-        return bands
-
-    def _bend(self, points: Floats) -> Floats:
-        """Multiply (N, 3) with the bending matrix."""
-        diagonal, first, second = self.bending
-        product: Floats = diagonal[:, None] * points
-        product[:-1] += first[:-1, None] * points[1:]
-        product[1:] += first[:-1, None] * points[:-1]
-        product[:-2] += second[:-2, None] * points[2:]
-        product[2:] += second[:-2, None] * points[:-2]
-        return product
+def _untwisted(segments: Sequence[tuple[int, int]], stiffness: Sequence[float]) -> Spans:
+    """Return parts that begin to be stepped, given their first and last segments and stiffness [N m]."""
+    count = len(segments)
+    return Spans(np.array(segments, np.int64).reshape(-1, 2), np.array(stiffness, dtype=float),
+                 np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 2, 3)), np.zeros((count, 2, 3)))
 
 
-_ROWS, _COLUMNS = (np.array(indices) for indices in ((0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 1, 0)))
+def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans) -> Spans:
+    """
+    Return the parts of a DLO between two clamps.
+
+    :param rigid: (N - 1,) segments that are held.
+    :param compliances: (N - 2,) [1/(N m)] of each inner node against twist.
+    :param before: those until now; what is still between the same clamps stays twisted.
+    """
+    held = np.flatnonzero(rigid).tolist()
+    pairs = [(a, b) for a, b in zip(held[:-1], held[1:], strict=True) if b > a + 1]
+    spans = _untwisted(pairs, [1 / compliances[a:b].sum() for a, b in pairs])
+    for k, pair in enumerate(spans.segments):
+        for old in np.flatnonzero((before.segments == pair).all(axis=1)
+                                  & (before.stiffness == spans.stiffness[k])):
+            for now, then in zip(spans[2:], before[2:], strict=True):  # its angle, and how it began
+                now[k] = then[old]
+    return spans
 
 
 def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: Floats) -> Floats:
@@ -271,18 +204,3 @@ def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: Fl
         for b in range(a + 1):
             bands[a - b, b:n - 2 + b] += row[a] * row[b]
     return bands
-
-
-@lru_cache(maxsize=4)
-def _stretching_places(n: int) -> tuple[Indices, Floats]:
-    """Where stretching blocks go in the flat (BANDS, N, 3) lower bands, and with which sign."""
-    def place(row: Indices, column: Indices) -> Indices:
-        at: Indices = (row - column) * 3 * n + column
-        return at
-
-    nodes = 3 * np.arange(n)[:, None]
-    same = place(nodes + _ROWS, nodes + _COLUMNS).ravel()
-    rows, columns = np.divmod(np.arange(9), 3)
-    next_ = place(nodes[:-1] + 3 + rows, nodes[:-1] + columns).ravel()
-    return np.concatenate([same, next_]), np.concatenate([np.ones(len(same)), -np.ones(len(next_))])
-PHASE0 = None

@@ -4,7 +4,6 @@
 """The choice of an engine: what each name gives, what it refuses, and what is told."""
 
 import logging
-import sys
 
 import pytest
 from toy_messages import toy_trials
@@ -19,8 +18,6 @@ from dlo_calibration.simulation.bullet import BulletSimulator
 
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')
-COMPILED = 'dlo_calibration.simulation.compiled'
-KERNELS = 'dlo_calibration.simulation.kernels'
 
 
 @pytest.fixture
@@ -29,15 +26,6 @@ def notices(caplog):
     engines._tell.cache_clear()
     caplog.set_level(logging.WARNING, 'dlo_calibration')
     return lambda: [record.getMessage() for record in caplog.records]
-
-
-@pytest.fixture
-def without_numba(monkeypatch):
-    """Let numba not be installed."""
-    monkeypatch.setitem(sys.modules, 'numba', None)
-    for name in (COMPILED, KERNELS):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.delattr('dlo_calibration.simulation.kernels', raising=False)  # where it was imported before
 
 
 @pytest.fixture
@@ -53,7 +41,6 @@ def test_what_can_be_chosen_can_be_made():
 
 
 def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
-    pytest.importorskip('numba')
     for engine in ('auto', 'compiled'):
         assert make_simulator(Options(engine=engine)).name == 'compiled'
     assert notices() == []
@@ -64,34 +51,6 @@ def test_bullet_is_one_option_away(notices):
     assert type(simulator) is BulletSimulator
     assert simulator.name == 'bullet'
     assert notices() == []
-
-
-def test_without_numba_auto_is_bullet_and_says_so_once(without_numba, notices):
-    for _ in range(3):
-        assert type(make_simulator(Options())) is BulletSimulator
-    assert notices() == ['rounds are simulated by PyBullet, about 30 times slower, because numba is not '
-                         'installed: pip install numba, or apt install python3-numba']
-
-
-def test_without_numba_the_compiled_engine_is_refused(without_numba):
-    with pytest.raises(InputError) as refusal:
-        make_simulator(Options(engine='compiled'))
-    assert str(refusal.value) == (
-        'engine compiled: got a Python where numba is not installed, expected an installed numba; pip '
-        'install numba, or apt install python3-numba; or use engine bullet or auto')
-
-
-def test_a_numba_that_does_not_fit_is_not_called_missing(monkeypatch, notices):
-    class Broken:
-        def find_spec(self, name, *_):
-            if name == COMPILED:
-                raise ImportError('Numba needs NumPy 2.0 or less')
-
-    monkeypatch.delitem(sys.modules, COMPILED, raising=False)
-    monkeypatch.setattr(sys, 'meta_path', [Broken(), *sys.meta_path])
-    assert make_simulator(Options()).name == 'bullet'
-    notice, = notices()
-    assert 'because numba cannot be used (Numba needs NumPy 2.0 or less): pip install' in notice
 
 
 def test_the_compiled_engine_refuses_a_scene_by_name(scene):

@@ -300,8 +300,8 @@ def test_starts_by_itself_after_enough_trials(start_node):
 
 def test_notices_of_the_package_are_in_the_log_of_the_node(start_node):
     robot = start_node()
-    logging.getLogger('dlo_calibration.calibration.engines').warning('numba is not installed')
-    robot.until(lambda: any(entry.msg == 'numba is not installed' and entry.level == LOG_WARN
+    logging.getLogger('dlo_calibration.calibration.engines').warning('engine compiled knows no scene')
+    robot.until(lambda: any(entry.msg == 'engine compiled knows no scene' and entry.level == LOG_WARN
                             for entry in robot.heard['log']))
 
 

@@ -1,14 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The compiled engine against the one that it stands for: each kernel step by step, whole trials too."""
+"""The compiled engine: each kernel against NumPy, and whole trials against Bullet."""
 
 from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+import oracles
 import pytest
+from stepping import SteppedRod, Touching
 from test_rod import crumpled, GRAVITY, straight
 
 from dlo_calibration import Chain, SimulationError
@@ -16,12 +18,10 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
 from dlo_calibration.simulation.nodes import Layout
-from dlo_calibration.simulation.rod import Rod, RodProperties
-from dlo_calibration.simulation.self_contact import SelfContact
+from dlo_calibration.simulation.rod import RodProperties
 
 SAMPLES = Path(__file__).parents[2] / 'msg_samples'
 STEP = 0.004
@@ -46,16 +46,11 @@ def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, s
     velocities = generator.normal(size=points.shape)
     nodes = np.sort(generator.choice(count, min(held, count - 1), replace=False))
     follow = generator.normal(size=(len(nodes), 3))
-    rod = Rod(rest, some_properties(generator, curvature), STEP, generator.uniform(0, 1, count))
+    rod = SteppedRod(rest, some_properties(generator, curvature), STEP, generator.uniform(0, 1, count))
     rod.hold(nodes)
-    spans = rod.spans.copy()
-    expected = rod.velocities(points, velocities, GRAVITY, follow)
-    expected[nodes] = follow
-    got = np.empty_like(points)
-    assert kernels.rod_velocities(
-        points, velocities + STEP * GRAVITY, got, nodes.astype(np.int64), follow, rod.rest_lengths,
-        rod.stiffness, rod.masses, rod.bending, rod.natural, spans, rod.drag, rod.implicit, STEP,
-        np.empty((3 * count + 6, 7)), np.empty(3 * count + 6))
+    rod.state.follow[:] = follow
+    expected = oracles.rod_velocities(rod.state, points, velocities + STEP * GRAVITY)
+    got = rod.velocities(points, velocities, GRAVITY, follow)
     assert np.abs(got - expected).max() < 1e-8 * max(1, np.abs(expected).max())
 
 
@@ -70,24 +65,10 @@ def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius,
     velocities = generator.normal(0, 0.5, points.shape)
     inverse = generator.uniform(0.5, 2, len(points)) * (generator.random(len(points)) > 0.1)
     support = generator.normal(0, 0.05, points.shape) * supported
-    places = np.concatenate([[0.0], np.cumsum(rest)])
-    contact = SelfContact(places, radius, friction, STEP)
-    contact.start(points + generator.normal(0, 0.002, points.shape))
-    expected = contact.velocities(points, velocities, inverse, support)
-
-    generator = np.random.default_rng(seed)  # the same start once more
-    generator.normal(0, 0.6, segments), generator.normal(0, 0.2, segments)
-    generator.normal(0, 0.5, points.shape), generator.uniform(0.5, 2, len(points))
-    generator.random(len(points)), generator.normal(0, 0.05, points.shape)
-    begun = points + generator.normal(0, 0.002, points.shape)
-    pairs = np.empty((segments * (segments - 1) // 2, 2), np.int64)
-    distances, middles = np.empty((segments, segments)), places[:-1] + rest / 2
-    apart = max(np.pi * radius, rest.max() / 2)
-    kernels.start_distances(begun, middles, rest / 2, apart, 2 * radius, pairs, distances)
-    count = kernels.near_pairs(points, middles, rest / 2, apart, 2 * radius, 1.5, 1.0, pairs)
-    got = velocities.copy()
-    kernels.resolve(points, got, inverse, support, pairs[:count], distances, 2 * radius, friction, STEP,
-                    np.empty((len(pairs), kernels.CONTACT_COLUMNS)), np.empty_like(points))
+    touching = Touching(np.concatenate([[0.0], np.cumsum(rest)]), radius, friction, STEP)
+    touching.start(points + generator.normal(0, 0.002, points.shape))
+    expected = oracles.kept_apart(touching.state, points, velocities, inverse, support, STEP)
+    got = touching.velocities(points, velocities, inverse, support)
     assert got == pytest.approx(expected, abs=1e-9)
 
 
@@ -121,11 +102,10 @@ def test_a_trial_is_what_it_is_in_bullet(name):
 
 
 def test_a_rollout_that_diverges_ends_at_once():
-    rope = CompiledRope(11, STEP)
     rest = np.full(10, 0.05)
     points = straight(rest)
-    physical = ParameterSpace().physical({}, 0.5)
-    rope.reset(np.concatenate([[0.0], np.cumsum(rest)]), points, 1e200 * crumpled(0, rest), physical, None)
+    rope = CompiledRope(np.concatenate([[0.0], np.cumsum(rest)]), points, 1e200 * crumpled(0, rest),
+                        ParameterSpace().physical({}, 0.5), STEP)
     with pytest.raises(SimulationError, match='diverged'):
         rope.advance(np.zeros((10**9, 0, 3)))
 

@@ -7,9 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from stepping import SteppedRod as Rod
 
-from dlo_calibration import SimulationError
-from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration import ParameterSpace, SimulationError
+from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.rod import RodProperties
 
 GRAVITY = np.array([0, 0, -9.81])
 NONE = np.zeros(3)
@@ -29,7 +31,7 @@ def crumpled(seed, rest_lengths, size=0.1):
 
 def forces(rod, points, time_step):
     """Return the forces that a step so short that it changes nothing reveals."""
-    return rod.masses[:, None] * rod.velocities(points, np.zeros_like(points), NONE, FREE) / time_step
+    return rod.state.masses[:, None] * rod.velocities(points, np.zeros_like(points), NONE, FREE) / time_step
 
 
 def energy(points, rest, properties):
@@ -66,7 +68,7 @@ def test_a_straight_rod_of_its_own_length_is_without_force():
 
 
 def test_masses_follow_the_lengths():
-    masses = Rod(np.array([0.1, 0.3, 0.2]), CABLE, 0.004).masses
+    masses = Rod(np.array([0.1, 0.3, 0.2]), CABLE, 0.004).state.masses
     assert masses == pytest.approx(0.05 / 0.6 * np.array([0.05, 0.2, 0.25, 0.1]))
 
 
@@ -88,11 +90,11 @@ def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
     rod = Rod(rest, RodProperties(1e-2, 500.0, 0.05, internal_damping=internal_damping), 0.004)
     points = crumpled(seed, rest)
     velocities = generator.normal(size=points.shape)
-    before = rod.masses @ velocities
+    before = rod.state.masses @ velocities
     for _ in range(20):
         velocities = rod.velocities(points, velocities, NONE, FREE)
         points = points + 0.004 * velocities
-    assert rod.masses @ velocities == pytest.approx(before, abs=1e-10)
+    assert rod.state.masses @ velocities == pytest.approx(before, abs=1e-10)
 
 
 @settings(deadline=None, derandomize=True, max_examples=30)
@@ -108,7 +110,7 @@ def test_energy_never_grows(seed, bending, stretching, step):
     for _ in range(200):
         velocities = rod.velocities(points, velocities, NONE, FREE)
         points = points + step * velocities
-        total = energy(points, rest, properties) + (rod.masses[:, None] * velocities**2).sum() / 2
+        total = energy(points, rest, properties) + (rod.state.masses[:, None] * velocities**2).sum() / 2
         assert total < 1.05 * start
     assert total < start
 
@@ -192,14 +194,14 @@ def test_a_rod_takes_the_length_that_its_scale_says():
     assert np.abs(rod.velocities(1.1 * straight(rest), np.zeros((5, 3)), NONE, FREE)).max() < 1e-9
     velocities = rod.velocities(straight(rest), np.zeros((5, 3)), NONE, FREE)
     assert velocities[-1, 0] - velocities[0, 0] > 0.1  # it is compressed
-    assert rod.masses.sum() == pytest.approx(0.05)
+    assert rod.state.masses.sum() == pytest.approx(0.05)
 
 
 def test_markers_add_their_mass_where_they_are():
     features = np.array([0, 0.25, 0.75, 0, 1.0])
     rest = np.full(4, 0.05)
-    plain = Rod(rest, CABLE, 0.004).masses
-    marked = Rod(rest, RodProperties(1e-2, 500.0, 0.05, marker_mass=0.02), 0.004, features).masses
+    plain = Rod(rest, CABLE, 0.004).state.masses
+    marked = Rod(rest, RodProperties(1e-2, 500.0, 0.05, marker_mass=0.02), 0.004, features).state.masses
     assert marked - plain == pytest.approx(0.02 * features)
 
 
@@ -216,10 +218,9 @@ def test_held_nodes_follow_their_velocities():
     rest = np.full(10, 0.05)
     rod = Rod(rest, CABLE, 0.004)
     rod.hold((7, 2))
-    assert rod.held.tolist() == [2, 7]
     given_ones = np.array([[0.1, 0, 0], [0, -0.2, 0.3]])
     velocities = rod.velocities(crumpled(0, rest), np.zeros((11, 3)), GRAVITY, given_ones)
-    assert velocities[[2, 7]] == pytest.approx(given_ones, abs=1e-6)
+    assert velocities[[7, 2]] == pytest.approx(given_ones)
     rod.hold(())
     assert rod.velocities(straight(rest), np.zeros((11, 3)), GRAVITY, FREE) == pytest.approx(
         np.tile(0.004 * GRAVITY, (11, 1)))
@@ -230,5 +231,7 @@ def test_what_is_not_finite_is_a_simulation_error(bad):
     rest = np.full(4, 0.05)
     points = straight(rest)
     points[2, 1] = bad
-    with pytest.raises(SimulationError, match='diverged'), np.errstate(invalid='ignore'):
-        Rod(rest, CABLE, 0.004).velocities(points, np.zeros_like(points), GRAVITY, FREE)
+    physical = ParameterSpace().physical({}, 0.2)
+    rope = CompiledRope(straight(rest)[:, 0], points, np.zeros_like(points), physical, 0.004)
+    with pytest.raises(SimulationError, match='diverged'):
+        rope.advance(np.zeros((1, 0, 3)))

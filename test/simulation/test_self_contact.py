@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from stepping import SteppedRod, Touching
 
-from dlo_calibration.simulation.rod import Rod, RodProperties
-from dlo_calibration.simulation.self_contact import SelfContact
+from dlo_calibration.simulation.rod import RodProperties
 
 STEP = 0.004
 RADIUS = 0.005
@@ -33,7 +33,7 @@ def strands(gap, angle=0.0):
 
 
 def contact(places, friction=0.0, radius=RADIUS):
-    return SelfContact(places, radius, friction, STEP)
+    return Touching(places, radius, friction, STEP)
 
 
 def pushed(points, speed):
@@ -67,7 +67,7 @@ def test_strands_that_are_far_apart_move_freely():
 def nearest(angle, speed, friction, gap):
     """Throw two strands of a rod together and press them; return the least distance."""
     points, places = strands(gap, angle)
-    rod = Rod(np.diff(places), RodProperties(1e-3, 1e3, 0.05), STEP)
+    rod = SteppedRod(np.diff(places), RodProperties(1e-3, 1e3, 0.05), STEP)
     touching = contact(places, friction)
     touching.start(points)
     velocities = pushed(points, speed)
@@ -75,7 +75,7 @@ def nearest(angle, speed, friction, gap):
     least = np.inf
     for _ in range(60):
         velocities = rod.velocities(points, velocities + pressing, np.zeros(3), np.zeros((0, 3)))
-        velocities = touching.velocities(points, velocities, 1 / rod.masses, 0 * points)
+        velocities = touching.velocities(points, velocities, 1 / rod.state.masses, 0 * points)
         points = points + STEP * velocities
         least = min(least, distance(points))
     return least
@@ -221,7 +221,7 @@ def test_a_new_start_forgets_the_last():
 def test_neighbours_along_the_dlo_do_not_touch():
     """A straight DLO whose nodes are nearer than a diameter is at rest."""
     points = np.linspace(0, 0.2, 41)[:, None] * (1.0, 0, 0)
-    touching = SelfContact(np.linspace(0, 0.2, 41), 0.02, 0.5, STEP)
+    touching = Touching(np.linspace(0, 0.2, 41), 0.02, 0.5, STEP)
     touching.start(points)
     velocities = np.random.default_rng(0).normal(0, 0.01, points.shape)
     assert touching.velocities(points, velocities, np.ones(41), 0 * points) == pytest.approx(velocities)

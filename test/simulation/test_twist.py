@@ -6,25 +6,32 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from oracles import twist_forces
 import pytest
+from stepping import SteppedRod as Rod
 from test_rod import CABLE, crumpled, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.rod import Rod, RodProperties
-from dlo_calibration.simulation.twist import ANGLE, FIRST, LAST, spans_between, STIFFNESS, twist_forces
+from dlo_calibration.simulation.kernels import Spans
+from dlo_calibration.simulation.rod import RodProperties
 
 
 def clamped(count, stiffness=2.0):
     """Return the span between the first and the last segment of `count`."""
-    rigid = np.isin(np.arange(count), (0, count - 1))
-    return spans_between(rigid, np.full(count - 1, 1 / (stiffness * (count - 1))), np.zeros((0, 17)))
+    return Spans(np.array([[0, count - 1]]), np.array([stiffness]), np.zeros(1), np.zeros(1, np.int64),
+                 np.zeros((1, 2, 3)), np.zeros((1, 2, 3)))
+
+
+def copied(spans):
+    return Spans(*(field.copy() for field in spans))
 
 
 def forces(points, spans):
-    segments = np.diff(points, axis=0)
-    return twist_forces(segments, np.linalg.norm(segments, axis=1), spans)
+    compiled = np.zeros(points.size)
+    kernels.add_twist(points, spans, 1.0, compiled)
+    return compiled.reshape(-1, 3)
 
 
 def begun(seed, count=9):
@@ -41,11 +48,11 @@ def test_forces_are_the_slope_of_the_energy(seed):
     points, spans = begun(seed)
 
     def energy(points):
-        moved = spans.copy()
+        moved = copied(spans)
         forces(points, moved)
-        return moved[0, STIFFNESS] * moved[0, ANGLE]**2 / 2
+        return moved.stiffness[0] * moved.angle[0]**2 / 2
 
-    got = forces(points, spans.copy())
+    got = forces(points, copied(spans))
     # A clamp's segment may turn its frame: what acts on it is the clamp's affair.
     for index in np.ndindex(points.shape):
         if 2 <= index[0] < len(points) - 2:
@@ -59,22 +66,20 @@ def test_forces_are_the_slope_of_the_energy(seed):
 @given(st.integers(0, 2**31))
 def test_the_compiled_forces_are_the_same(seed):
     points, spans = begun(seed)
-    same = spans.copy()
+    same = copied(spans)
     for shift in (0.0, 0.002, 0.004):
         here = points + shift * np.random.default_rng(seed).normal(size=points.shape)
-        right = np.zeros(3 * len(points))
-        kernels.add_twist(here, same, 0.004, right)
-        expected = 0.004 * forces(here, spans)
-        assert right.reshape(-1, 3) == pytest.approx(expected, abs=1e-10 * max(1, np.abs(expected).max()))
-        assert same == pytest.approx(spans, abs=1e-9)
+        expected = twist_forces(here, spans)
+        assert forces(here, same) == pytest.approx(expected, abs=1e-10 * max(1, np.abs(expected).max()))
+        for got, field in zip(same, spans, strict=True):
+            assert got == pytest.approx(field, abs=1e-9)
 
 
 def test_the_compiled_frame_begins_untwisted():
     points = crumpled(3, np.full(9, 0.05), 0.3)
-    spans, right = clamped(9), np.zeros(30)
-    kernels.add_twist(points, spans, 0.004, right)
-    assert np.abs(right).max() < 1e-12
-    assert spans[0, ANGLE] == pytest.approx(0, abs=1e-9)
+    spans = clamped(9)
+    assert np.abs(forces(points, spans)).max() < 1e-12 / 0.004
+    assert spans.angle[0] == pytest.approx(0, abs=1e-9)
 
 
 def test_nothing_twists_in_a_plane():
@@ -87,25 +92,24 @@ def test_nothing_twists_in_a_plane():
 
 def test_parts_between_clamps_only_and_in_series():
     rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
-    assert len(rod.spans) == 0
+    assert len(rod.state.spans.segments) == 0
     rod.hold((3,))
-    assert len(rod.spans) == 0
+    assert len(rod.state.spans.segments) == 0
     rod.hold((0, 1, 5, 11, 12))  # the one in the middle is a pin
-    (span,) = rod.spans
-    assert (span[FIRST], span[LAST]) == (0, 11)
-    assert span[STIFFNESS] == pytest.approx(0.7 * 1e-2 / 0.5)
-    assert len(Rod(np.full(12, 0.05), CABLE, 0.004).spans) == 0
+    assert rod.state.spans.segments.tolist() == [[0, 11]]
+    assert rod.state.spans.stiffness == pytest.approx(0.7 * 1e-2 / 0.5)
+    assert len(Rod(np.full(12, 0.05), CABLE, 0.004).state.spans.segments) == 0
 
 
 def test_what_stays_between_the_same_clamps_stays_twisted():
     rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
     rod.hold((0, 1, 11, 12))
-    rod.spans[0, ANGLE] = 1.5
+    rod.state.spans.angle[0] = 1.5
     rod.hold((0, 1, 6, 11, 12))
-    assert rod.spans[0, ANGLE] == 1.5
+    assert rod.state.spans.angle[0] == 1.5
     rod.hold((0, 1))
     rod.hold((0, 1, 11, 12))
-    assert rod.spans[0, ANGLE] == 0
+    assert rod.state.spans.angle[0] == 0
 
 
 def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
@@ -117,10 +121,10 @@ def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
         points = straight(rest)
         points[2:-2] += 1e-4 * np.random.default_rng(0).normal(size=(39, 3))
         velocities = rod.velocities(points, np.zeros_like(points), NONE, np.zeros((4, 3)))
-        rod.spans[0, ANGLE] = angle = 8.987 * turns
+        rod.state.spans.angle[0] = angle = 8.987 * turns
         # The frame of the last clamp is what holds it twisted.
-        start, sideways = rod.spans[0, 14:17].copy(), np.cross(rod.spans[0, 11:14], rod.spans[0, 14:17])
-        rod.spans[0, 14:17] = np.cos(angle) * start + np.sin(angle) * sideways
+        frame, tangent = rod.state.spans.frames[0, 1], rod.state.spans.tangents[0, 1]
+        frame[:] = np.cos(angle) * frame + np.sin(angle) * np.cross(tangent, frame)
         for _ in range(2500):
             velocities = rod.velocities(points, velocities, NONE, np.zeros((4, 3)))
             points = points + 0.004 * velocities
@@ -131,11 +135,10 @@ def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
 
 def test_torsion_changes_a_loop_between_two_clamps_and_nothing_else():
     def rollout(torsion, clamps):
-        rope = CompiledRope(21, 0.004)
         rest = np.full(20, 0.03)
         points = straight(rest)
         physical = {**ParameterSpace().physical({}, 0.6), 'torsion': torsion, 'flexibility': 1e-3}
-        rope.reset(np.concatenate([[0.0], np.cumsum(rest)]), points, np.zeros((21, 3)), physical, None)
+        rope = CompiledRope(points[:, 0], points, np.zeros((21, 3)), physical, 0.004)
         rope.hold(clamps)
         way = np.linspace(0, 1, 500)[:, None, None] * (-0.45, 0.1, 0.0)
         still = np.array([0.0 if node < 10 else 1.0 for node in clamps])[:, None]

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Engine: what the simulators of trials share, whatever steps their rope."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Mapping, Self
+
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.table import rest_on, resting_level
+from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
+from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
+
+
+class Engine:
+    """
+    Simulates trials on a table or in the air.
+
+    The table is placed so that the rope rests on it at the measured height, whatever
+    radius is tried, so that a radius neither kicks it up nor lets it fall.
+
+    :param table: whether there is a table.
+    :param table_height: [m].
+    :param nodes: of the rope.
+    :param time_step: [s].
+    :param stable_distance: see `Settling` [m].
+    :param stable_time: see `Settling` [s].
+    :param settle_limit: see `Settling` [s].
+    """
+
+    name: str
+
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
+                 time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
+                 stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
+        self._table_height = table_height if table else None
+        self._nodes = nodes
+        self._time_step = time_step
+        self._settling = Settling(stable_distance, stable_time, settle_limit)
+        self._known: dict[int, tuple[Trial, Layout, float | None]] = {}
+
+    def prepare(self) -> None:
+        """Do nothing: the kernels were compiled, or taken from the cache, when they were imported."""
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """
+        Simulate a trial with physical parameters by name (SI units).
+
+        :raises SimulationError: where the rollout diverges.
+        :raises InputError: where the trial grips more points than there are nodes.
+        """
+        layout, level = self._layout(trial)
+        points = layout.points
+        if self._table_height is not None:
+            if level is None:
+                level = self._table_height + physical['self_collision']
+            points = rest_on(points, level)
+        return roll_out(trial, layout, self._rope(layout, points, physical, level), self._settling)
+
+    def _layout(self, trial: Trial) -> tuple[Layout, float | None]:
+        """Return what depends on the trial alone."""
+        if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
+            level = None if self._table_height is None else resting_level(trial, self._table_height)
+            self._known[id(trial)] = trial, Layout.of(trial, self._nodes), level
+        return self._known[id(trial)][1:]
+
+    def _rope(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+              level: float | None) -> Stepper:
+        """
+        Return a rope at its start.
+
+        :param points: (N, 3) [m] where its nodes are.
+        :param level: height [m] of nodes that touch the table; None: no table.
+        """
+        raise NotImplementedError
+
+    def refined(self) -> Self:
+        """Return one with twice the segments and half the time step."""
+        finer = copy.copy(self)
+        finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
+        return finer
+
+    def close(self) -> None:
+        """Forget the trials."""
+        self._known.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave behind what belongs to this process."""
+        return {**self.__dict__, '_known': {}}

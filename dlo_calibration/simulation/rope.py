@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rope: the nodes of a simulated DLO and all that the kernels work on, for every engine."""
+
+from __future__ import annotations
+
+from typing import Mapping, Sequence
+
+import numpy as np
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.rod import Rod, RodProperties
+
+
+class Rope:
+    """
+    A DLO of N nodes at its start.
+
+    :param places: (N,) [m] of the nodes along the DLO at rest, from 0, increasing.
+    :param points: (N, 3) [m] at the start.
+    :param velocities: (N, 3) [m/s] at the start.
+    :param physical: physical values by parameter name, in SI units.
+    :param time_step: [s].
+    :param gravity: (3,) [m/s^2].
+    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
+    """
+
+    def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+                 time_step: float, gravity: Floats, features: Floats | None = None) -> None:
+        self._rod = Rod(np.diff(places), RodProperties.of(physical), time_step, features)
+        points = np.array(points, dtype=float)
+        contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
+        kernels.start_distances(contact, points)
+        #: what the kernels work on; positions and velocities are changed in place
+        self.state = kernels.RopeState(
+            points=points, velocities=np.array(velocities, dtype=float), wanted=np.zeros_like(points),
+            support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
+            contact=contact)
+
+    @property
+    def points(self) -> Floats:
+        """The nodes' positions now, (N, 3) [m]; a copy."""
+        return self.state.points.copy()
+
+    def hold(self, nodes: Sequence[int]) -> None:
+        """Let exactly these nodes follow a path from now on."""
+        self._rod.hold(nodes)
+        self.state = self.state._replace(rod=self._rod.state)
+
+
+def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernels.SelfContact:
+    """
+    Return the contact of a DLO with itself.
+
+    :param rest_lengths: (S,) [m] of its segments.
+    :param radius: [m].
+    :param friction: Coulomb coefficient.
+    """
+    segments, half = len(rest_lengths), rest_lengths / 2
+    count = segments * (segments - 1) // 2
+    return kernels.SelfContact(
+        half=half, middles=rest_lengths.cumsum() - half, diameter=2.0 * radius,
+        apart=max(np.pi * radius, float(half.max())), friction=float(friction),
+        distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
+        near=np.zeros(1, np.int64), room=np.full(1, -1.0),
+        contacts=kernels.Contacts(
+            nodes=np.empty((count, 4), np.int64), weights=np.empty((count, 4)), yielding=np.empty((count, 4)),
+            normals=np.empty((count, 3)), mobility=np.empty(count), wanted=np.empty(count),
+            pushed=np.empty(count), rubbed=np.empty((count, 3)), impulse=np.empty(3)),
+        change=np.empty((segments + 1, 3)))
+
+
+def diverged() -> SimulationError:
+    """Return the error about a kernel that found no finite step."""
+    return SimulationError('the rollout diverged: the chain is no longer finite')
