@@ -66,7 +66,8 @@ def _state(record: Any) -> Any:
     return record
 
 
-# A field is taken out of its record before a loop, not in it: each time, Numba counts a reference.
+# Numba counts references to all arrays of a record that a kernel is called with, and to a field that
+# is taken out.  So fields are taken out before a loop, and a step calls with few records.
 
 
 def _part(kernel: Kernel) -> Kernel:
@@ -724,10 +725,26 @@ def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities:
 
 
 @_part
+def _travel(velocities: Matrix, step: float) -> float:
+    """Return how far the two fastest nodes may come nearer to each other in a step [m]."""
+    fastest = 0.0
+    for i in range(len(velocities)):
+        fastest = max(fastest, velocities[i, 0]**2 + velocities[i, 1]**2 + velocities[i, 2]**2)
+    return 2 * step * math.sqrt(fastest)
+
+
+@_part
+def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> bool:
+    """Tell whether any pair is near; `room` and `near` are those of `SelfContact`."""
+    room[0] -= _travel(velocities, step)
+    return room[0] < 0 or near[0] > 0
+
+
+@_part
 def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector,
                support: Matrix, step: float) -> None:
     """
-    Make `velocities` what the contacts between pairs of segments allow.
+    Make `velocities` what the contacts between pairs of segments allow, where they `may_touch`.
 
     They are velocity constraints, solved by Jacobi iterations with mass splitting (Tonge et al., Mass
     Splitting for Jitter-Free Parallel Rigid Body Simulation, 2012).
@@ -738,17 +755,10 @@ def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse
     :param support: (N, 3) [m/s] change of velocity that other bodies last caused.
     :param step: [s].
     """
-    fastest = 0.0
-    for i in range(len(points)):
-        fastest = max(fastest, velocities[i, 0]**2 + velocities[i, 1]**2 + velocities[i, 2]**2)
-    travel = 2 * step * math.sqrt(fastest)
-    room, near = contact.room, contact.near
-    room[0] -= travel
-    if room[0] < 0:
-        near[0] = near_pairs(contact, points, STRETCH, travel + SKIN)
-        room[0] = SKIN
-    if near[0] == 0:
-        return
+    near = contact.near
+    if contact.room[0] < 0:
+        near[0] = near_pairs(contact, points, STRETCH, _travel(velocities, step) + SKIN)
+        contact.room[0] = SKIN
     count = _touching(contact, near[0], points, velocities, step)
     if count == 0:
         return
@@ -783,20 +793,15 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
 
 
 @_part
-def _want(rope: RopeState, rod: RodState, contact: SelfContact, targets: Matrix) -> bool:
-    """Do what `want` says, with what is within the rope taken out of it."""
-    points, velocities, wanted, gravity = rope.points, rope.velocities, rope.wanted, rope.gravity
-    held, follow, step = rod.held, rod.follow, rod.step
+def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Matrix, held: Indices,
+                follow: Matrix, step: float) -> None:
+    """Add gravity to the velocities, and find those of the held nodes."""
     for h in range(len(held)):
         for c in range(3):
             follow[h, c] = (targets[h, c] - points[held[h], c]) / step
     for i in range(len(points)):
         for c in range(3):
             velocities[i, c] += step * gravity[c]
-    if not rod_velocities(rod, points, velocities, wanted):
-        return False
-    keep_apart(contact, points, wanted, rod.inverse_masses, rope.support, step)
-    return True
 
 
 @_compiled
@@ -807,7 +812,14 @@ def want(rope: RopeState, targets: Matrix) -> bool:
     :param targets: (h, 3) [m] where the held nodes are after the step.
     :returns: False where the rollout diverges.
     """
-    return _want(rope, rope.rod, rope.contact, targets)
+    rod, contact = rope.rod, rope.contact
+    points, velocities, wanted = rope.points, rope.velocities, rope.wanted
+    _start_step(points, velocities, rope.gravity, targets, rod.held, rod.follow, rod.step)
+    if not rod_velocities(rod, points, velocities, wanted):
+        return False
+    if may_touch(wanted, rod.step, contact.room, contact.near):
+        keep_apart(contact, points, wanted, rod.inverse_masses, rope.support, rod.step)
+    return True
 
 
 @_compiled
@@ -820,12 +832,16 @@ def advance(rope: RopeState, targets: Cube, level: float, path: Cube) -> int:
     :param path: (k, N, 3) to write where all nodes are after each step [m]; or empty.
     :returns: how many steps were taken; fewer than k where the rollout diverged.
     """
-    rod, contact = rope.rod, rope.contact
+    rod, contact, gravity, inverse_masses = rope.rod, rope.contact, rope.gravity, rope.rod.inverse_masses
     points, velocities, wanted, support = rope.points, rope.velocities, rope.wanted, rope.support
     held, follow, step, friction = rod.held, rod.follow, rod.step, contact.friction
+    room, near = contact.room, contact.near
     for k in range(len(targets)):
-        if not _want(rope, rod, contact, targets[k]):
+        _start_step(points, velocities, gravity, targets[k], held, follow, step)
+        if not rod_velocities(rod, points, velocities, wanted):
             return k
+        if may_touch(wanted, step, room, near):
+            keep_apart(contact, points, wanted, inverse_masses, support, step)
         for i in range(len(points)):
             for c in range(3):
                 velocities[i, c] = wanted[i, c]

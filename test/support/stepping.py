@@ -35,5 +35,6 @@ class Touching:
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         allowed = velocities.copy()
-        kernels.keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
+        if kernels.may_touch(allowed, self._step, self.state.room, self.state.near):
+            kernels.keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
         return allowed
