@@ -28,6 +28,8 @@ Vector = Floats
 Matrix = Floats
 Cube = Floats
 Indices = NDArray[np.int64]
+Spans = NDArray[np.void]
+Contacts = NDArray[np.void]
 IndexRows = NDArray[np.int64]
 #: type that a kernel is compiled for, by the annotation
 TYPES: dict[str, Any] = {
@@ -53,7 +55,7 @@ SKIN = 0.004  # m; pairs that near are watched until the nodes may have moved th
 # Bullet's treatment of a contact, as found by single steps of a sphere on a plane (PyBullet 3.2.7):
 SLOP = 1e-5  # m that it lets a contact penetrate
 PUSHED_OUT = 0.08  # share of a deeper penetration that one step removes
-CONTACT = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
+MARGIN = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
 
 BAND = 7  # entries of a column of the matrix: node i couples to i + 2, three coordinates each
 
@@ -83,25 +85,27 @@ def _compiled(kernel: Kernel) -> Kernel:
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-@_state
-class Spans(NamedTuple):
-    """
-    The s parts of a DLO between two clamps.
+#: a part of a DLO between two clamps
+SPAN = np.dtype([
+    ('first', 'i8'), ('last', 'i8'),  # segments, which the clamps hold
+    ('stiffness', 'f8'),  # torque per angle [N m]
+    ('angle', 'f8'),  # of twist [rad]
+    ('begun', 'i8'),  # 1 where it has been stepped since the clamps closed, else 0
+    ('start', 'f8', 3), ('start_frame', 'f8', 3),  # unit vectors along and across the first when it began
+    ('end', 'f8', 3), ('end_frame', 'f8', 3)], align=True)  # and of the last
 
-    :param segments: (s, 2) the first and the last, which the clamps hold.
-    :param stiffness: (s,) torque per angle [N m].
-    :param angle: (s,) of twist [rad].
-    :param begun: (s,) 1 where it has been stepped since the clamps closed, else 0.
-    :param tangents: (s, 2, 3) unit vectors along both segments when it began.
-    :param frames: (s, 2, 3) unit vectors across both segments when it began.
-    """
+#: two segments that touch each other
+CONTACT = np.dtype([
+    ('nodes', 'i8', 4),  # the ends of the first and of the second
+    ('weights', 'f8', 4),  # of the nodes' velocities in that of the closest points to each other
+    ('yielding', 'f8', 4),  # inverse masses of the nodes [1/kg], 0 where something supports them
+    ('normal', 'f8', 3),  # unit vector from the second to the first
+    ('mobility', 'f8'),  # velocity per impulse [1/kg]
+    ('wanted', 'f8'),  # least velocity at which they part [m/s]
+    ('pushed', 'f8'), ('rubbed', 'f8', 3),  # impulses along the normal and across it until now [N s]
+    ('impulse', 'f8', 3)], align=True)  # of the iteration under way [N s]
 
-    segments: IndexRows
-    stiffness: Vector
-    angle: Vector
-    begun: Indices
-    tangents: Cube
-    frames: Cube
+TYPES['Spans'], TYPES['Contacts'] = numba.from_dtype(SPAN)[::1], numba.from_dtype(CONTACT)[::1]
 
 
 @_state
@@ -115,7 +119,7 @@ class RodState(NamedTuple):
     :param inverse_masses: (N,) [1/kg], 0 for held nodes.
     :param bending: (3, N) bending matrix [N/m]: its diagonal and the two below it.
     :param natural: (N - 2,) [N m] EI times natural curvature at each inner node; (0,): straight at rest.
-    :param spans: what resists twist.
+    :param spans: (s,) of `SPAN`: what resists twist.
     :param held: (h,) nodes that follow given velocities.
     :param follow: (h, 3) [m/s] these velocities.
     :param drag: [1/s].
@@ -142,33 +146,6 @@ class RodState(NamedTuple):
 
 
 @_state
-class Contacts(NamedTuple):
-    """
-    Workspace: pairs of segments that touch each other, c at most.
-
-    :param nodes: (c, 4) the ends of the first and of the second segment.
-    :param weights: (c, 4) of the nodes' velocities in that of the closest points to each other.
-    :param yielding: (c, 4) inverse masses [1/kg] of the nodes, 0 where something supports them.
-    :param normals: (c, 3) unit vectors from the second to the first segment.
-    :param mobility: (c,) velocity per impulse [1/kg].
-    :param wanted: (c,) least velocity at which they part [m/s].
-    :param pushed: (c,) impulse along the normal until now [N s].
-    :param rubbed: (c, 3) impulse across it until now [N s].
-    :param impulse: (3,) [N s] of the contact under way.
-    """
-
-    nodes: IndexRows
-    weights: Matrix
-    yielding: Matrix
-    normals: Matrix
-    mobility: Vector
-    wanted: Vector
-    pushed: Vector
-    rubbed: Matrix
-    impulse: Vector
-
-
-@_state
 class SelfContact(NamedTuple):
     """
     Contact of S segments with each other: capsules that do not pass through each other.
@@ -188,7 +165,7 @@ class SelfContact(NamedTuple):
     :param pairs: (S (S - 1) / 2, 2), of which the first ones are near each other now.
     :param near: (1,) how many.
     :param room: (1,) how far nodes may move before others are [m]; less than 0: not known.
-    :param contacts: workspace.
+    :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
     :param change: (S + 1, 3), workspace.
     """
 
@@ -376,7 +353,8 @@ def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> 
             d, e = (c + 1) % 3, (c + 2) % 3
             joint = moments[i] * (
                 (b[d] * frames[i, e] - b[e] * frames[i, d]
-                 + a[d] * frames[i + 1, e] - a[e] * frames[i + 1, d]) / (2 * halves[i]) + both * (a[d] * b[e] - a[e] * b[d]))
+                 + a[d] * frames[i + 1, e] - a[e] * frames[i + 1, d]) / (2 * halves[i])
+                + both * (a[d] * b[e] - a[e] * b[d]))
             torques[i + 1, c] += joint
             torques[i, c] -= joint
         sum_ -= a[0] * torques[i, 0] + a[1] * torques[i, 1] + a[2] * torques[i, 2]
@@ -408,35 +386,39 @@ def add_twist(points: Matrix, spans: Spans, step: float, right: Vector) -> None:
     n = len(points) - 1
     tangents, torques, lengths = np.empty((n, 3)), np.zeros((n, 3)), np.empty(n)
     _along(points, tangents, lengths)
-    frame, there = np.empty(3), np.empty(3)
-    for k in range(len(spans.segments)):
-        a, b = spans.segments[k, 0], spans.segments[k, 1]
-        if spans.begun[k] == 0:
-            spans.tangents[k, 0] = tangents[a]
-            _across(tangents[a], spans.frames[k, 0])
-        frame[:] = spans.frames[k, 0]
-        _carry(frame, spans.tangents[k, 0], tangents[a])
+    frame, there, before = np.empty(3), np.empty(3), np.empty(3)
+    for k in range(len(spans)):
+        span = spans[k]
+        a, b = span.first, span.last
+        if span.begun == 0:
+            _across(tangents[a], frame)
+            for c in range(3):
+                span.start[c], span.start_frame[c] = tangents[a, c], frame[c]
+        for c in range(3):
+            before[c], frame[c] = span.start[c], span.start_frame[c]
+        _carry(frame, before, tangents[a])
         for i in range(a, b):
             _carry(frame, tangents[i], tangents[i + 1])
-        if spans.begun[k] == 0:
-            spans.begun[k] = 1
-            spans.tangents[k, 1] = tangents[b]
-            spans.frames[k, 1] = frame
-        there[:] = spans.frames[k, 1]
-        _carry(there, spans.tangents[k, 1], tangents[b])
+        if span.begun == 0:
+            span.begun = 1
+            for c in range(3):
+                span.end[c], span.end_frame[c] = tangents[b, c], frame[c]
+        for c in range(3):
+            before[c], there[c] = span.end[c], span.end_frame[c]
+        _carry(there, before, tangents[b])
         x, y = 0.0, 0.0
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3
             x += frame[c] * there[c]
             y += tangents[b, c] * (frame[d] * there[e] - frame[e] * there[d])
         angle = math.atan2(y, x)
-        angle += 2 * math.pi * round((spans.angle[k] - angle) / (2 * math.pi))
-        spans.angle[k] = angle
+        angle += 2 * math.pi * round((span.angle - angle) / (2 * math.pi))
+        span.angle = angle
         for i in range(a, b):
             square = 0.0
             for c in range(3):
                 square += (tangents[i, c] + tangents[i + 1, c])**2
-            share = spans.stiffness[k] * angle / max(square / 2, 2 * HAIRPIN)
+            share = span.stiffness * angle / max(square / 2, 2 * HAIRPIN)
             for c in range(3):
                 joint = share * (tangents[i, c] + tangents[i + 1, c])
                 torques[i + 1, c] -= joint
@@ -515,7 +497,7 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, wanted: Ma
         bands[j + 2, 3] -= zz
     if len(rod.natural) > 0:
         add_natural(points, rod.natural, step, right)
-    if len(rod.spans.segments) > 0:
+    if len(rod.spans) > 0:
         add_twist(points, rod.spans, step, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
@@ -610,11 +592,10 @@ def start_distances(contact: SelfContact, points: Matrix) -> None:
 
 
 @_part
-def _touching(contact: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
+def _touching(touching: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
     """Fill in which of the first `near` pairs would come too near within a step; return how many."""
-    distances, diameter, pairs, contacts = (
-        contact.distances, contact.diameter, contact.pairs, contact.contacts)
-    nodes, weights, normals, least = contacts.nodes, contacts.weights, contacts.normals, contacts.wanted
+    distances, diameter = touching.distances, touching.diameter
+    pairs, contacts = touching.pairs, touching.contacts
     count = 0
     for k in range(near):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -624,16 +605,17 @@ def _touching(contact: SelfContact, near: int, points: Matrix, velocities: Matri
         gap = distance - allowed
         wanted = -gap / step if gap > 0 else min(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT)
         approach = 0.0
-        normals[count, 0], normals[count, 1], normals[count, 2] = n0, n1, n2
-        nodes[count, 0], nodes[count, 1], nodes[count, 2], nodes[count, 3] = i, i + 1, j, j + 1
-        weights[count, 0], weights[count, 1] = 1 - s, s
-        weights[count, 2], weights[count, 3] = -(1 - t), -t
+        contact = contacts[count]
+        contact.normal[0], contact.normal[1], contact.normal[2] = n0, n1, n2
+        contact.nodes[0], contact.nodes[1], contact.nodes[2], contact.nodes[3] = i, i + 1, j, j + 1
+        contact.weights[0], contact.weights[1] = 1 - s, s
+        contact.weights[2], contact.weights[3] = -(1 - t), -t
         for m in range(4):
-            at = nodes[count, m]
-            approach += weights[count, m] * (
+            at = contact.nodes[m]
+            approach += contact.weights[m] * (
                 velocities[at, 0] * n0 + velocities[at, 1] * n1 + velocities[at, 2] * n2)
         if approach < wanted:
-            least[count] = wanted
+            contact.wanted = wanted
             count += 1
     return count
 
@@ -646,82 +628,79 @@ def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Ma
     A node does not yield to a push against what supports it (a strand on a table carries another
     one), but passes the push on to that body.
     """
-    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
-    mobility, pushed, rubbed = contacts.mobility, contacts.pushed, contacts.rubbed
     change[:] = 0.0
     for k in range(count):
         for m in range(4):
-            change[nodes[k, m], 0] += 1.0  # how many contacts share the node
+            change[contacts[k].nodes[m], 0] += 1.0  # how many contacts share the node
     for k in range(count):
+        contact = contacts[k]
         given, full, shared = 0.0, 0.0, 0.0
         for m in range(4):
-            at, w = nodes[k, m], weights[k, m]
+            at, w = contact.nodes[m], contact.weights[m]
             backing, size = 0.0, 0.0
             for c in range(3):
-                backing += support[at, c] * normals[k, c]
+                backing += support[at, c] * contact.normal[c]
                 size += support[at, c] * support[at, c]
             if w < 0:
                 backing = -backing
             elif w == 0:
                 backing = 0.0
             resistance = max(SUPPORTED * math.sqrt(size), UNSUPPORTED)
-            yielding[k, m] = inverse_masses[at] if backing > -resistance else 0.0
-            given += w * w * yielding[k, m]
+            contact.yielding[m] = inverse_masses[at] if backing > -resistance else 0.0
+            given += w * w * contact.yielding[m]
             full += w * w * inverse_masses[at]
         for m in range(4):
-            at = nodes[k, m]
+            at = contact.nodes[m]
             if given < WEDGED * full:
-                yielding[k, m] = inverse_masses[at]
-            shared += weights[k, m]**2 * yielding[k, m] * change[at, 0]
-        mobility[k] = shared if shared > 0 else math.inf  # both held
-        pushed[k] = 0.0
+                contact.yielding[m] = inverse_masses[at]
+            shared += contact.weights[m]**2 * contact.yielding[m] * change[at, 0]
+        contact.mobility = shared if shared > 0 else math.inf  # both held
+        contact.pushed = 0.0
         for c in range(3):
-            rubbed[k, c] = 0.0
+            contact.rubbed[c] = 0.0
 
 
 @_part
 def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Matrix, change: Matrix) -> None:
     """Make one iteration over the first `count` contacts, with Coulomb friction."""
-    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
-    mobility, wanted, pushed, rubbed, impulse = (
-        contacts.mobility, contacts.wanted, contacts.pushed, contacts.rubbed, contacts.impulse)
     change[:] = 0.0
     for k in range(count):
+        contact = contacts[k]
         approach, size = 0.0, 0.0
         for c in range(3):
             relative = 0.0
             for m in range(4):
-                relative += weights[k, m] * velocities[nodes[k, m], c]
-            impulse[c] = relative
-            approach += relative * normals[k, c]
-        push = max(pushed[k] + (wanted[k] - approach) / mobility[k], 0.0)
+                relative += contact.weights[m] * velocities[contact.nodes[m], c]
+            contact.impulse[c] = relative
+            approach += relative * contact.normal[c]
+        push = max(contact.pushed + (contact.wanted - approach) / contact.mobility, 0.0)
         for c in range(3):
-            impulse[c] = rubbed[k, c] - (impulse[c] - approach * normals[k, c]) / mobility[k]
-            size += impulse[c]**2
+            contact.impulse[c] = contact.rubbed[c] - (
+                contact.impulse[c] - approach * contact.normal[c]) / contact.mobility
+            size += contact.impulse[c]**2
         share = min(1.0, friction * push / max(math.sqrt(size), TINY))
         for c in range(3):
-            rub = share * impulse[c]
-            impulse[c] = rub - rubbed[k, c] + (push - pushed[k]) * normals[k, c]
-            rubbed[k, c] = rub
-        pushed[k] = push
+            rub = share * contact.impulse[c]
+            contact.impulse[c] = rub - contact.rubbed[c] + (push - contact.pushed) * contact.normal[c]
+            contact.rubbed[c] = rub
+        contact.pushed = push
         for m in range(4):
-            factor = weights[k, m] * yielding[k, m]
+            factor = contact.weights[m] * contact.yielding[m]
             for c in range(3):
-                change[nodes[k, m], c] += factor * impulse[c]
+                change[contact.nodes[m], c] += factor * contact.impulse[c]
     velocities += change
 
 
 @_part
 def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities: Matrix) -> None:
     """Let the nodes that did not yield pass the impulses on to what supports them."""
-    nodes, weights, yielding, normals = contacts.nodes, contacts.weights, contacts.yielding, contacts.normals
-    pushed, rubbed = contacts.pushed, contacts.rubbed
     for k in range(count):
+        contact = contacts[k]
         for m in range(4):
-            at = nodes[k, m]
-            passed_on = weights[k, m] * (inverse_masses[at] - yielding[k, m])
+            at = contact.nodes[m]
+            passed_on = contact.weights[m] * (inverse_masses[at] - contact.yielding[m])
             for c in range(3):
-                velocities[at, c] += passed_on * (pushed[k] * normals[k, c] + rubbed[k, c])
+                velocities[at, c] += passed_on * (contact.pushed * contact.normal[c] + contact.rubbed[c])
 
 
 @_part
@@ -737,7 +716,7 @@ def _travel(velocities: Matrix, step: float) -> float:
 def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> bool:
     """Tell whether any pair is near; `room` and `near` are those of `SelfContact`."""
     room[0] -= _travel(velocities, step)
-    return room[0] < 0 or near[0] > 0
+    return bool(room[0] < 0 or near[0] > 0)
 
 
 @_part
@@ -778,7 +757,7 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
     """
     for i in range(len(points)):
         distance = points[i, 2] - level
-        if distance > CONTACT:
+        if distance > MARGIN:
             continue
         depth = -(distance + SLOP)
         wanted = PUSHED_OUT * depth / step if depth > 0 else depth / step

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import PART_NAMES
-from dlo_calibration.simulation.kernels import BAND, RodState, Spans
+from dlo_calibration.simulation.kernels import BAND, RodState, SPAN, Spans
 
 IMPLICIT = 0.6  # see the module
 
@@ -109,7 +109,7 @@ class Rod:
         self.state = RodState(
             rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
             masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), natural=np.zeros(0),
-            spans=_untwisted((), ()), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
+            spans=np.zeros(0, SPAN), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
             drag=float(properties.drag),
             implicit=float(time_step * max(properties.internal_damping, IMPLICIT * time_step)),
             step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
@@ -165,16 +165,9 @@ class Rod:
         return stiffness
 
 
-def _untwisted(segments: Sequence[tuple[int, int]], stiffness: Sequence[float]) -> Spans:
-    """Return parts that begin to be stepped, given their first and last segments and stiffness [N m]."""
-    count = len(segments)
-    return Spans(np.array(segments, np.int64).reshape(-1, 2), np.array(stiffness, dtype=float),
-                 np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 2, 3)), np.zeros((count, 2, 3)))
-
-
 def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans) -> Spans:
     """
-    Return the parts of a DLO between two clamps.
+    Return the parts of a DLO between two clamps, (s,) of `SPAN`.
 
     :param rigid: (N - 1,) segments that are held.
     :param compliances: (N - 2,) [1/(N m)] of each inner node against twist.
@@ -182,12 +175,13 @@ def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans)
     """
     held = np.flatnonzero(rigid).tolist()
     pairs = [(a, b) for a, b in zip(held[:-1], held[1:], strict=True) if b > a + 1]
-    spans = _untwisted(pairs, [1 / compliances[a:b].sum() for a, b in pairs])
-    for k, pair in enumerate(spans.segments):
-        for old in np.flatnonzero((before.segments == pair).all(axis=1)
-                                  & (before.stiffness == spans.stiffness[k])):
-            for now, then in zip(spans[2:], before[2:], strict=True):  # its angle, and how it began
-                now[k] = then[old]
+    spans = np.zeros(len(pairs), SPAN)
+    for k, (a, b) in enumerate(pairs):
+        span = spans[k]
+        span['first'], span['last'], span['stiffness'] = a, b, 1 / compliances[a:b].sum()
+        for old in before:
+            if all(old[name] == span[name] for name in ('first', 'last', 'stiffness')):
+                spans[k] = old
     return spans
 
 

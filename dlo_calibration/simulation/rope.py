@@ -66,10 +66,7 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
         apart=max(np.pi * radius, float(half.max())), friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
         near=np.zeros(1, np.int64), room=np.full(1, -1.0),
-        contacts=kernels.Contacts(
-            nodes=np.empty((count, 4), np.int64), weights=np.empty((count, 4)), yielding=np.empty((count, 4)),
-            normals=np.empty((count, 3)), mobility=np.empty(count), wanted=np.empty(count),
-            pushed=np.empty(count), rubbed=np.empty((count, 3)), impulse=np.empty(3)),
+        contacts=np.empty(count, kernels.CONTACT),
         change=np.empty((segments + 1, 3)))
 
 

@@ -14,18 +14,15 @@ from test_rod import CABLE, crumpled, NONE, straight
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.kernels import Spans
+from dlo_calibration.simulation.kernels import SPAN
 from dlo_calibration.simulation.rod import RodProperties
 
 
 def clamped(count, stiffness=2.0):
     """Return the span between the first and the last segment of `count`."""
-    return Spans(np.array([[0, count - 1]]), np.array([stiffness]), np.zeros(1), np.zeros(1, np.int64),
-                 np.zeros((1, 2, 3)), np.zeros((1, 2, 3)))
-
-
-def copied(spans):
-    return Spans(*(field.copy() for field in spans))
+    spans = np.zeros(1, SPAN)
+    spans['last'], spans['stiffness'] = count - 1, stiffness
+    return spans
 
 
 def forces(points, spans):
@@ -48,11 +45,11 @@ def test_forces_are_the_slope_of_the_energy(seed):
     points, spans = begun(seed)
 
     def energy(points):
-        moved = copied(spans)
+        moved = spans.copy()
         forces(points, moved)
-        return moved.stiffness[0] * moved.angle[0]**2 / 2
+        return moved['stiffness'][0] * moved['angle'][0]**2 / 2
 
-    got = forces(points, copied(spans))
+    got = forces(points, spans.copy())
     # A clamp's segment may turn its frame: what acts on it is the clamp's affair.
     for index in np.ndindex(points.shape):
         if 2 <= index[0] < len(points) - 2:
@@ -66,20 +63,20 @@ def test_forces_are_the_slope_of_the_energy(seed):
 @given(st.integers(0, 2**31))
 def test_the_compiled_forces_are_the_same(seed):
     points, spans = begun(seed)
-    same = copied(spans)
+    same = spans.copy()
     for shift in (0.0, 0.002, 0.004):
         here = points + shift * np.random.default_rng(seed).normal(size=points.shape)
         expected = twist_forces(here, spans)
         assert forces(here, same) == pytest.approx(expected, abs=1e-10 * max(1, np.abs(expected).max()))
-        for got, field in zip(same, spans, strict=True):
-            assert got == pytest.approx(field, abs=1e-9)
+        for name in SPAN.names:
+            assert same[name] == pytest.approx(spans[name], abs=1e-9)
 
 
 def test_the_compiled_frame_begins_untwisted():
     points = crumpled(3, np.full(9, 0.05), 0.3)
     spans = clamped(9)
     assert np.abs(forces(points, spans)).max() < 1e-12 / 0.004
-    assert spans.angle[0] == pytest.approx(0, abs=1e-9)
+    assert spans['angle'][0] == pytest.approx(0, abs=1e-9)
 
 
 def test_nothing_twists_in_a_plane():
@@ -92,24 +89,25 @@ def test_nothing_twists_in_a_plane():
 
 def test_parts_between_clamps_only_and_in_series():
     rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
-    assert len(rod.state.spans.segments) == 0
+    assert len(rod.state.spans) == 0
     rod.hold((3,))
-    assert len(rod.state.spans.segments) == 0
+    assert len(rod.state.spans) == 0
     rod.hold((0, 1, 5, 11, 12))  # the one in the middle is a pin
-    assert rod.state.spans.segments.tolist() == [[0, 11]]
-    assert rod.state.spans.stiffness == pytest.approx(0.7 * 1e-2 / 0.5)
-    assert len(Rod(np.full(12, 0.05), CABLE, 0.004).state.spans.segments) == 0
+    (span,) = rod.state.spans
+    assert (span['first'], span['last']) == (0, 11)
+    assert span['stiffness'] == pytest.approx(0.7 * 1e-2 / 0.5)
+    assert len(Rod(np.full(12, 0.05), CABLE, 0.004).state.spans) == 0
 
 
 def test_what_stays_between_the_same_clamps_stays_twisted():
     rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
     rod.hold((0, 1, 11, 12))
-    rod.state.spans.angle[0] = 1.5
+    rod.state.spans['angle'][0] = 1.5
     rod.hold((0, 1, 6, 11, 12))
-    assert rod.state.spans.angle[0] == 1.5
+    assert rod.state.spans['angle'][0] == 1.5
     rod.hold((0, 1))
     rod.hold((0, 1, 11, 12))
-    assert rod.state.spans.angle[0] == 0
+    assert rod.state.spans['angle'][0] == 0
 
 
 def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
@@ -121,9 +119,9 @@ def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
         points = straight(rest)
         points[2:-2] += 1e-4 * np.random.default_rng(0).normal(size=(39, 3))
         velocities = rod.velocities(points, np.zeros_like(points), NONE, np.zeros((4, 3)))
-        rod.state.spans.angle[0] = angle = 8.987 * turns
+        rod.state.spans['angle'][0] = angle = 8.987 * turns
         # The frame of the last clamp is what holds it twisted.
-        frame, tangent = rod.state.spans.frames[0, 1], rod.state.spans.tangents[0, 1]
+        frame, tangent = rod.state.spans['end_frame'][0], rod.state.spans['end'][0]
         frame[:] = np.cos(angle) * frame + np.sin(angle) * np.cross(tangent, frame)
         for _ in range(2500):
             velocities = rod.velocities(points, velocities, NONE, np.zeros((4, 3)))

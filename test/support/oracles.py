@@ -40,7 +40,7 @@ def rod_velocities(rod, points, velocities):
         matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += rod.implicit * ends
     if len(rod.natural):
         forces += natural_forces(points, rod.natural)
-    if len(rod.spans.segments):
+    if len(rod.spans):
         forces += twist_forces(points, rod.spans)
     right = rod.masses[:, None] * velocities + rod.step * forces
     pull = HELD * rod.masses[rod.held, None]
@@ -107,18 +107,21 @@ def twist_forces(points, spans):
     lengths = np.linalg.norm(segments, axis=1)
     tangents = segments / lengths[:, None]
     torques = np.zeros_like(segments)
-    for k, (a, b) in enumerate(spans.segments):
+    for span in spans:
+        a, b = span['first'], span['last']
         part = tangents[a:b + 1]
         frame = frame_along(part)
-        if not spans.begun[k]:
-            spans.begun[k] = 1
-            spans.tangents[k], spans.frames[k] = part[[0, -1]], frame[[0, -1]]
-        here, there = (_turned(spans.tangents[k, end], spans.frames[k, end], part[-end]) for end in (0, 1))
+        if not span['begun']:
+            span['begun'] = 1
+            span['start'], span['start_frame'], span['end'], span['end_frame'] = (
+                part[0], frame[0], part[-1], frame[-1])
+        here = _turned(span['start'], span['start_frame'], part[0])
+        there = _turned(span['end'], span['end_frame'], part[-1])
         angle = _angle(frame[-1], there, part[-1]) - _angle(frame[0], here, part[0])
-        angle += 2 * math.pi * round((spans.angle[k] - angle) / (2 * math.pi))
-        spans.angle[k] = angle
+        angle += 2 * math.pi * round((span['angle'] - angle) / (2 * math.pi))
+        span['angle'] = angle
         both = part[:-1] + part[1:]
-        joints = spans.stiffness[k] * angle * both / np.maximum(
+        joints = span['stiffness'] * angle * both / np.maximum(
             np.einsum('ij,ij->i', both, both) / 2, 2 * HAIRPIN)[:, None]
         torques[a + 1:b + 1] -= joints
         torques[a:b] += joints
