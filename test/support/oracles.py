@@ -47,7 +47,9 @@ def rod_velocities(rod, points, velocities):
     right[rod.held] += pull * rod.follow
     at = (3 * rod.held[:, None] + np.arange(3)).ravel()
     matrix[at, at] += np.repeat(pull, 3)
-    found = np.linalg.solve(matrix, right.ravel()).reshape(-1, 3)
+    scale = 1 / np.sqrt(np.diag(matrix))  # what is held is 1e12 times as heavy
+    found = scale * np.linalg.solve(scale[:, None] * matrix * scale, scale * right.ravel())
+    found = found.reshape(-1, 3)
     found[rod.held] = rod.follow
     return found
 
