@@ -390,6 +390,8 @@ def test_random_and_corner_parameter_sets_stay_finite(make):
     simulator = make(settle_limit=1.0)
     generator, count = np.random.default_rng(0), len(PARAMETERS)
     sets = np.concatenate([generator.integers(0, 2, (40, count)), generator.random((20, count))])
+    if simulator.name == 'bullet':
+        sets = sets[::5]  # the same kernels, and far slower
     for k, point in enumerate(sets):
         trial = (drag_trial(noise=0.001), fold_trial())[k % 2]
         values = SPACE.values(point)
