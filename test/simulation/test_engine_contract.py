@@ -255,7 +255,7 @@ def test_a_repeat_is_bit_exact_in_another_process(make):
             'from test_engine_contract import *\n'
             'make = next(factory for factory in FACTORIES if factory.name == sys.argv[3])\n'
             'print(digest(rollout(make(**{"nodes": NODES, "time_step": TIME_STEP, **SMALL}))))')
-    tests = Path(__file__).parents[2]
+    tests = Path(__file__).parents[1]
     folders = [str(tests / name) for name in ('simulation', 'support')]
     printed = subprocess.run([sys.executable, '-c', code, *folders, here.name],
                              capture_output=True, text=True, check=True).stdout

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from stepping import SteppedRod as Rod
 
-from dlo_calibration import ParameterSpace, SimulationError
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledRope
 from dlo_calibration.simulation.rod import RodProperties
 
