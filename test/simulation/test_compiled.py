@@ -75,7 +75,7 @@ def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius,
 def sample(name, marked=()):
     """Return the trials of a sample, with some points marked as features, and its options."""
     session = read_session(SAMPLES / name, None)
-    options = Options.of(session.options or {})
+    options = session.options or Options()
     trials, _ = session_trials(session, options)
     features = np.isin(np.arange(len(trials[0].initial)), marked)
     return [Trial(trial.name, Chain(trial.initial.points, trial.initial.hands, features), trial.actions,
