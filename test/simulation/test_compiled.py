@@ -14,7 +14,6 @@ from stepping import SteppedRod, Touching
 from test_rod import crumpled, GRAVITY, straight
 
 from dlo_calibration import Chain, SimulationError
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
@@ -75,7 +74,7 @@ def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius,
 def sample(name, marked=()):
     """Return the trials of a sample, with some points marked as features, and its options."""
     session = read_session(SAMPLES / name, None)
-    options = session.options or Options()
+    options = session.options
     trials, _ = session_trials(session, options)
     features = np.isin(np.arange(len(trials[0].initial)), marked)
     return [Trial(trial.name, Chain(trial.initial.points, trial.initial.hands, features), trial.actions,
