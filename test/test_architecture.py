@@ -4,6 +4,7 @@
 """Imports run one way, and heavy libraries stay where they belong."""
 
 import ast
+import importlib
 import os
 from pathlib import Path
 import subprocess
@@ -63,6 +64,25 @@ def rooms_of(names: set[str]) -> set[str]:
 def test_every_folder_is_a_room():
     folders = {path.name for path in FOLDER.iterdir() if path.is_dir() and path.name != '__pycache__'}
     assert folders - set(ROOMS) == set(), 'give each room its place in ROOMS'
+
+
+@pytest.mark.parametrize('folder', [name for name in ROOMS if (FOLDER / name).is_dir()])
+def test_every_room_says_what_it_is_and_what_it_offers(folder):
+    offered = importlib.import_module(f'{PACKAGE}.{folder}')
+    assert len(offered.__doc__) > 30
+    for name in getattr(offered, '__all__', ()):
+        assert hasattr(offered, name)
+    assert hasattr(offered, '__all__') or folder in ('ros', 'cli'), 'list what it offers'
+
+
+def test_no_module_is_too_long_to_read():
+    """The kernels stay in one file, as Numba's cache looks at that file alone."""
+    lines = {file: file.read_text(encoding='utf-8').count('\n') for file in FILES if file.stem != 'kernels'}
+    assert {file.name: count for file, count in lines.items() if count > 400} == {}
+
+
+def test_only_these_modules_stand_outside_the_rooms():
+    assert {file.stem for file in FOLDER.glob('*.py')} == {'__init__', '__main__', *SHARED}
 
 
 @pytest.mark.parametrize('file', FILES, ids=lambda file: str(file.relative_to(FOLDER)))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Appraiser: what each trial tells, found out beside whoever asks, before anything is calibrated.
+LiveInformation: what each trial tells, found out beside whoever asks, before anything is calibrated.
 
 It simulates in a process of its own: PyBullet and the import of Numba hold
 the interpreter's lock, and a process can be ended at once, in the middle of a
@@ -53,7 +53,7 @@ class _Job:
         self.thread = thread
 
 
-class Appraiser:
+class LiveInformation:
     """
     Appraises trials in a thread, one session after the other.
 

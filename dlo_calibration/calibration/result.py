@@ -95,8 +95,9 @@ class CalibrationResult:
             uncertainty = examination.uncertainty if examination.regular else replace(
                 uncertainty, excited=examination.uncertainty.excited)
         return cls(
-            space=found.space, parameters=estimates(found.space, best, uncertainty, known.guessed), best=best,
-            trials=trials, chains=simulated_chains(trials, best), evaluations=found.evaluations, seconds=0.0,
+            space=found.space, best=best, trials=trials,
+            parameters=parameter_estimates(found.space, best, uncertainty, known.guessed),
+            chains=simulated_chains(trials, best), evaluations=found.evaluations, seconds=0.0,
             search=found.search, engine=setting.simulator.name, stop_reason=found.stop_reason,
             seed=setting.options.seed, warnings=_warnings(best, found.evaluations), examination=examination)
 
@@ -141,7 +142,7 @@ class CalibrationResult:
         return self.space.physical(self.values, self.length)
 
 
-def estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty,
+def parameter_estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty,
               guessed: Sequence[str] = ()) -> dict[str, ParameterEstimate]:
     """
     Return the parameters of the best evaluation with their uncertainty, in both units.

@@ -1,4 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One parameter set tried on all trials, here, in processes or on a cluster."""
+"""One parameter set tried on all trials, here, in processes or on a cluster; and its residuals."""
+
+from dlo_calibration.evaluation.batch import BatchEvaluator
+from dlo_calibration.evaluation.cluster import ClusterExecutor
+from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.robust import Huber
+
+__all__ = ['BatchEvaluator', 'ClusterExecutor', 'Evaluation', 'Evaluator', 'Huber', 'Linearisation',
+           'ProcessExecutor', 'ResidualLayout']

@@ -2,3 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """The paper's experiment: how consistent found parameters are, and how valid."""
+
+from dlo_calibration.experiment.conduct import Plan
+from dlo_calibration.experiment.journal import Journal
+from dlo_calibration.experiment.outcome import Outcome
+from dlo_calibration.experiment.study import Subject, Task
+
+__all__ = ['Journal', 'Outcome', 'Plan', 'Subject', 'Task']

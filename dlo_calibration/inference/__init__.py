@@ -2,3 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """What a fit tells: intervals, what is identifiable, which action would tell more, what is missing."""
+
+from dlo_calibration.inference.advice import Advice, advise
+from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.inference.examination import Examination, examine
+from dlo_calibration.inference.missing_parameters import MissingParameter
+from dlo_calibration.inference.slices import Slices
+from dlo_calibration.inference.trial_information import TrialInformation
+from dlo_calibration.inference.uncertainty import Uncertainty
+
+__all__ = ['Advice', 'Confirmation', 'Examination', 'MissingParameter', 'Slices', 'TrialInformation',
+           'Uncertainty', 'advise', 'examine']

@@ -1,4 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wire: messages in and out, and the trials that they make; imports no rclpy."""
+"""The wire: messages to and from the calibrator, and the trials that they make; imports no rclpy."""
+
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, read
+from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.messages.encoder import trial_messages
+
+__all__ = ['ActionMessage', 'ChainMessage', 'TrialCollector', 'read', 'trial_messages']

@@ -46,7 +46,7 @@ from typing import Iterable
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import INITIAL
-from dlo_calibration.messages.trial_builder import Key, Message, order, Segment
+from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
 from dlo_calibration.model.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
@@ -68,7 +68,7 @@ class TrialCollector:
     def clear(self) -> None:
         """Forget all messages, and the frame_id that they shared."""
         self._frame: str | None = None
-        self._segments = [Segment((0, 0, ()))]
+        self._segments = [TrialBuilder((0, 0, ()))]
         self._known: dict[Key, Message] = {}
         self._newest: Key = (0, 0, ())
         self._spare = 0
@@ -101,7 +101,7 @@ class TrialCollector:
         if key > self._newest:
             self._newest = key
             if message.kind == INITIAL and last.busy:
-                last = Segment(key)
+                last = TrialBuilder(key)
                 self._segments.append(last)
             before = last.spare
             error = last.extend(message, self._options)
@@ -187,16 +187,16 @@ class TrialCollector:
     def _insert(self, message: Message, key: Key) -> InputError | None:
         """Take a message that is earlier than another; return why it is not used, if it is not."""
         begin = end = self._place(key)
-        waiting, folded, found = [message], list[Segment](), None
+        waiting, folded, found = [message], list[TrialBuilder](), None
         # further segments change only as long as the next start is not the next trial's
         while end < len(self._segments) and not (end > begin and folded[-1].busy):
             waiting = sorted([*waiting, *self._segments[end].messages()], key=order)
             if not folded:
-                folded.append(Segment(self._segments[begin].first))
+                folded.append(TrialBuilder(self._segments[begin].first))
             for one in waiting:
                 orphans = begin == 0 and len(folded) == 1
                 if one.kind == INITIAL and folded[-1].busy and (folded[-1].starts or orphans):
-                    folded.append(Segment(order(one)))
+                    folded.append(TrialBuilder(order(one)))
                 error = folded[-1].extend(one, self._options)
                 if one is message:
                     found = error
@@ -223,7 +223,7 @@ class TrialCollector:
     def _forget(self) -> None:
         """Forget the oldest messages that no trial uses, until half of KEPT are left."""
         surplus = self._spare - KEPT // 2
-        kept: list[Segment] = []
+        kept: list[TrialBuilder] = []
         for segment, following in zip(self._segments, [*self._segments[1:], None], strict=True):
             before = segment.spare
             if surplus <= 0:
@@ -239,7 +239,7 @@ class TrialCollector:
         self._segments = kept
         self._spare = sum(segment.spare for segment in kept)
 
-    def _trim(self, segment: Segment, surplus: int) -> None:
+    def _trim(self, segment: TrialBuilder, surplus: int) -> None:
         """Forget the oldest spare messages of a segment that stays."""
         count = min(surplus, len(segment.starts) - 2)
         if count > 0:
@@ -273,7 +273,7 @@ class TrialCollector:
         self._forgotten = merged
 
 
-def _cut_off(segment: Segment, until: str, remedy: str) -> tuple[InputError, ...]:
+def _cut_off(segment: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:
     """Return why a segment to which nothing more comes is no trial, if more than its start came."""
     if segment.complete or not (segment.moves or segment.waiting):
         return ()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Segment: the messages from one start to the next, of which a trial is made."""
+"""TrialBuilder: the messages from one start to the next, of which a trial is made."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Sight:
 
 
 @dataclass
-class Segment:
+class TrialBuilder:
     """
     Messages from one start to the next: a trial, complete or not.
 

@@ -1,4 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What chains alone say: their noise, what lies and hangs in them, and first guesses of parameters."""
+"""What observed chains say before anything is simulated: noise, what lies and hangs, prior estimates."""
+
+from dlo_calibration.observation.estimate import prior_estimates, PriorEstimate
+from dlo_calibration.observation.excitation import excites
+from dlo_calibration.observation.noise import smooth
+from dlo_calibration.observation.table import resting_level
+
+__all__ = ['PriorEstimate', 'excites', 'prior_estimates', 'resting_level', 'smooth']

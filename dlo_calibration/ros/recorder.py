@@ -16,7 +16,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.report.page import Origin, repeating_command, write_evaluations
-from dlo_calibration.ros.report_writer import Reporter
+from dlo_calibration.ros.report_writer import ReportWriter
 
 
 class Recorder:
@@ -29,7 +29,7 @@ class Recorder:
 
     def __init__(self, on_failure: Callable[[str], None], make_simulator: SimulatorFactory) -> None:
         self._on_failure = on_failure
-        self._reporter = Reporter(make_simulator)
+        self._reporter = ReportWriter(make_simulator)
         self._session: SessionWriter | None = None
 
     @property

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reporter: writes the page of a result in a thread of its own, as it takes seconds."""
+"""ReportWriter: writes the page of a result in a thread of its own, as it takes seconds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dlo_calibration.report.page import Origin, write_report
 PATIENCE = 10.0  # s that the end waits for a page
 
 
-class Reporter:
+class ReportWriter:
     """
     Writes pages; nothing that goes wrong there is raised.
 

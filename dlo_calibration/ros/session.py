@@ -16,7 +16,7 @@ import time
 from typing import Any, Callable, Protocol
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.live_information import Appraiser
+from dlo_calibration.calibration.live_information import LiveInformation
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
@@ -147,7 +147,7 @@ class CalibrationSession:
         self._collected_with = graph.options()
         self._collector = TrialCollector(self._collected_with)
         self._worker = Worker(make_simulator)
-        self._appraiser = Appraiser(make_simulator)
+        self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._memory = _Memory()
         self._calibration: _Calibration | None = None

@@ -22,7 +22,7 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
-from dlo_calibration.simulation.nodes import feature_shares, Layout, spread_places
+from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene, unusable
 from dlo_calibration.simulation.protocol import DEFAULT_NODES
 from dlo_calibration.simulation.rope import diverged, Rope
@@ -241,7 +241,7 @@ class BulletSimulator(Engine):
         self._obstacles = _obstacles(scene) if scene else ()
         self._world: _World | None = None
 
-    def _rope(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+    def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> BulletRope:
         radius = physical['self_collision'] if self._obstacles else _World.SPHERE
         if self._world is not None and self._world.radius != radius:
@@ -275,7 +275,7 @@ class _World:
     SPHERE = 0.005  # m; the radius where there is a plane only
     AWAY = -1e3  # m: where there is no table
 
-    def __init__(self, layout: Layout, physical: Mapping[str, float], time_step: float, radius: float,
+    def __init__(self, layout: NodeLayout, physical: Mapping[str, float], time_step: float, radius: float,
                  obstacles: Sequence[Obstacle]) -> None:
         self.radius = radius
         self._client = pybullet.connect(pybullet.DIRECT)
@@ -294,7 +294,7 @@ class _World:
         self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=radius)
         self._among_obstacles = bool(obstacles)
 
-    def start(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+    def start(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               touching: float | None) -> BulletRope:
         """Place rope and table; `touching` [m] is the height of the rope's middle on the table."""
         height = self.AWAY if touching is None else touching - self.radius

@@ -18,7 +18,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
-from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rope import diverged, Rope
 
 NO_PATH = np.empty((0, 0, 3))
@@ -55,7 +55,7 @@ class CompiledSimulator(Engine):
 
     name = 'compiled'
 
-    def _rope(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+    def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> CompiledRope:
         return CompiledRope(layout.places, points, layout.velocities, physical, self._time_step, level,
                             layout.features)

@@ -11,7 +11,7 @@ from typing import Any, Mapping, Self
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import rest_on, resting_level
-from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
 
@@ -41,7 +41,7 @@ class Engine:
         self._nodes = nodes
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
-        self._known: dict[int, tuple[Trial, Layout, float | None]] = {}
+        self._known: dict[int, tuple[Trial, NodeLayout, float | None]] = {}
 
     def prepare(self) -> None:
         """Do nothing: the kernels were compiled, or taken from the cache, when they were imported."""
@@ -61,14 +61,14 @@ class Engine:
             points = rest_on(points, level)
         return roll_out(trial, layout, self._rope(layout, points, physical, level), self._settling)
 
-    def _layout(self, trial: Trial) -> tuple[Layout, float | None]:
+    def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None]:
         """Return what depends on the trial alone."""
         if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
             level = None if self._table_height is None else resting_level(trial, self._table_height)
-            self._known[id(trial)] = trial, Layout.of(trial, self._nodes), level
+            self._known[id(trial)] = trial, NodeLayout.of(trial, self._nodes), level
         return self._known[id(trial)][1:]
 
-    def _rope(self, layout: Layout, points: Floats, physical: Mapping[str, float],
+    def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> Stepper:
         """
         Return a rope at its start.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Layout: where the nodes of the simulated DLO lie, and how observed points follow from them."""
+"""NodeLayout: where the nodes of the simulated DLO lie, and how observed points follow from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
 
 @dataclass(frozen=True)
-class Layout:
+class NodeLayout:
     """
     Nodes of the simulated DLO.
 
@@ -43,7 +43,7 @@ class Layout:
         return tuple(int(np.abs(self.places - self.point_places[grip]).argmin()) for grip in hand.grips)
 
     @classmethod
-    def of(cls, trial: Trial, count: int) -> Layout:
+    def of(cls, trial: Trial, count: int) -> NodeLayout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 

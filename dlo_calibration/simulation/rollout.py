@@ -23,7 +23,7 @@ import numpy as np
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Rollout
 
 CHECKS = 5  # of the displacement within one stable_time
@@ -67,7 +67,7 @@ class Stepper(Protocol):
         """
 
 
-def roll_out(trial: Trial, layout: Layout, stepper: Stepper, settling: Settling) -> Rollout:
+def roll_out(trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settling) -> Rollout:
     """
     Simulate a trial on a stepper that is at its start.
 
@@ -85,7 +85,7 @@ class _Grip:
 
 
 class _Course:
-    def __init__(self, trial: Trial, layout: Layout, stepper: Stepper, settling: Settling) -> None:
+    def __init__(self, trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settling) -> None:
         self._trial = trial
         self._layout = layout
         self._stepper = stepper

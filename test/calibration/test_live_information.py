@@ -13,7 +13,7 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
-from dlo_calibration.calibration.live_information import Appraiser
+from dlo_calibration.calibration.live_information import LiveInformation
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.trial import Goal
@@ -33,7 +33,7 @@ def appraised(appraiser, trials, *rest, **more):
 
 @pytest.fixture
 def appraiser():
-    found = Appraiser(lambda _: ToySimulator())
+    found = LiveInformation(lambda _: ToySimulator())
     yield found
     found.stop()
     assert found.join(PATIENCE)
@@ -89,7 +89,7 @@ def test_trials_of_a_result_are_not_appraised_and_later_ones_add_to_it(appraiser
     (ToySimulator(fail_below=101.0), 'trial 1: diverged'),
     (ToySimulator(crash=True), 'RuntimeError: the toy')])
 def test_a_trial_that_cannot_be_simulated_gives_a_sentence(toy, words):
-    told, = appraised(Appraiser(lambda _: toy), TRIALS[:1])
+    told, = appraised(LiveInformation(lambda _: toy), TRIALS[:1])
     assert told.problem.startswith(words)
     assert '\n' not in told.words
 
@@ -98,13 +98,13 @@ def test_an_engine_that_cannot_be_had_gives_a_sentence():
     def refuse(options):
         raise DloCalibrationError('no such engine')
 
-    told, = appraised(Appraiser(refuse), TRIALS[:2])
+    told, = appraised(LiveInformation(refuse), TRIALS[:2])
     assert told.words == 'what trial 2 tells is not known: no such engine'
 
 
 def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
     before = set(children(os.getpid()))
-    appraiser = Appraiser(lambda _: ToySimulator(seconds=1000.0))
+    appraiser = LiveInformation(lambda _: ToySimulator(seconds=1000.0))
     appraiser.start(TRIALS, OPTIONS)
     begun = time.monotonic()
     while not set(children(os.getpid())) - before:

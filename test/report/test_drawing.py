@@ -152,12 +152,12 @@ def test_instants_between_change_nothing_of_the_course(held_by):
                 if path is not None:
                     path[k] = self._points
 
-    from dlo_calibration.simulation.nodes import Layout
+    from dlo_calibration.simulation.nodes import NodeLayout
     trial, = toy_trials(1)
     trial = replace(trial, goals=(replace(trial.goals[0], held_by=held_by),))
     courses = []
     for one in (trial, densely(trial)):
-        layout = Layout.of(one, 11)
+        layout = NodeLayout.of(one, 11)
         stepper = Held(layout.points)
         courses.append((roll_out(one, layout, stepper, Settling()), stepper.course))
     (plain, before), (dense, after) = courses

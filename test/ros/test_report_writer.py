@@ -12,7 +12,7 @@ from toy_simulator import new_toy, ToySimulator
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.report.page import Origin
-from dlo_calibration.ros.report_writer import Reporter
+from dlo_calibration.ros.report_writer import ReportWriter
 
 OPTIONS = Options.of({'workers': 1, 'evaluations': 20})
 ORIGIN = Origin('session', 'a command', OPTIONS)
@@ -26,7 +26,7 @@ def result():
 
 def test_page_has_slices_simulated_elsewhere(result, tmp_path):
     threads = []
-    reporter = Reporter(lambda _: threads.append(threading.current_thread()) or ToySimulator())
+    reporter = ReportWriter(lambda _: threads.append(threading.current_thread()) or ToySimulator())
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)
     reporter.begin(tmp_path / 'report_2.html', result, ORIGIN)
     for thread in reporter._threads:
@@ -39,7 +39,7 @@ def test_page_has_slices_simulated_elsewhere(result, tmp_path):
 
 
 def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path):
-    reporter = Reporter(lambda _: ToySimulator(0.1))  # the slices would take half a minute
+    reporter = ReportWriter(lambda _: ToySimulator(0.1))  # the slices would take half a minute
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)
     reporter.close()
     page = (tmp_path / 'report.html').read_text(encoding='utf-8')
@@ -49,7 +49,7 @@ def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path):
 
 @pytest.mark.parametrize('engine', [ToySimulator(crash=True), None])
 def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine):
-    reporter = Reporter(lambda _: engine)
+    reporter = ReportWriter(lambda _: engine)
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)
     reporter.close()
     assert 'Left out' in (tmp_path / 'report.html').read_text(encoding='utf-8')
@@ -57,7 +57,7 @@ def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine):
 
 
 def test_page_that_cannot_be_written_is_told_once(result, tmp_path):
-    reporter = Reporter(lambda _: ToySimulator())
+    reporter = ReportWriter(lambda _: ToySimulator())
     reporter.begin(tmp_path / 'none' / 'report.html', result, ORIGIN)
     reporter.close()
     told, = reporter.failures()

@@ -19,7 +19,7 @@ from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
-from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rod import RodProperties
 
 SAMPLES = Path(__file__).parents[2] / 'msg_samples'
@@ -117,6 +117,6 @@ def test_a_layout_is_known_until_the_simulator_is_closed():
     other = sample('object2', (5,))[0][0]
     heavy = simulator.simulate(other, {**physical, 'marker_mass': 0.1}).chains
     assert np.abs(heavy - first).max() > 1e-4
-    assert Layout.of(other, 31).features.sum() == pytest.approx(1)
+    assert NodeLayout.of(other, 31).features.sum() == pytest.approx(1)
     simulator.close()
     assert simulator.simulate(trials[0], physical).chains.tobytes() == first.tobytes()

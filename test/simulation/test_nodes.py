@@ -10,7 +10,7 @@ import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
 from dlo_calibration.observation.table import rest_on, resting_level
-from dlo_calibration.simulation.nodes import feature_shares, Layout, spread_places
+from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 
 
 def arc(count=21, height=0.0):
@@ -43,7 +43,7 @@ def test_places_contain_the_fixed_ones_and_are_as_even_as_these_allow(widths, mo
 @settings(deadline=None, max_examples=50)
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=10, unique=True), st.integers(12, 60))
 def test_every_gripped_point_has_a_node_of_its_own(grips, count):
-    layout = Layout.of(trial(arc(), (tuple(grips),)), count)
+    layout = NodeLayout.of(trial(arc(), (tuple(grips),)), count)
     assert layout.places.shape == (count,)
     assert layout.points.shape == layout.velocities.shape == (count, 3)
     nodes = layout.nodes(trial(arc(), (tuple(grips),)).hands[0])
@@ -56,30 +56,30 @@ def test_every_gripped_point_has_a_node_of_its_own(grips, count):
 @given(st.integers(0, 18), st.integers(12, 80))
 def test_a_clamp_that_holds_from_the_start_has_no_node_within(first, count):
     one = trial(arc(), ((first, first + 1),))
-    a, b = Layout.of(one, count).nodes(one.hands[0])
+    a, b = NodeLayout.of(one, count).nodes(one.hands[0])
     assert b == a + 1
-    free = np.delete(np.diff(Layout.of(one, count).places), a)
+    free = np.delete(np.diff(NodeLayout.of(one, count).places), a)
     assert free.max() < 2.1 * free.min() + 1e-9 or count < 20
 
 
 def test_points_between_those_that_a_hand_grips_keep_their_nodes():
     one = trial(arc(), ((2, 6),))
-    a, b = Layout.of(one, 61).nodes(one.hands[0])
+    a, b = NodeLayout.of(one, 61).nodes(one.hands[0])
     assert b > a + 4
 
 
 def test_a_piece_that_is_clamped_later_bends_until_then():
     later = Hand('late', (10, 11), [0.5, 1.0], np.zeros((2, 3)))
     one = Trial('t', Chain(arc()), (Action((later,)),), (Goal(Chain(arc()), 2.0),))
-    assert Layout.of(one, 81).places == pytest.approx(spread_places(Layout.of(one, 81).point_places[
+    assert NodeLayout.of(one, 81).places == pytest.approx(spread_places(NodeLayout.of(one, 81).point_places[
         [0, 10, 11, 20]], 81))
-    a, b = Layout.of(one, 81).nodes(later)
+    a, b = NodeLayout.of(one, 81).nodes(later)
     assert b > a + 1
 
 
 @pytest.mark.parametrize('count', [15, 31, 61])
 def test_nodes_lie_on_the_curve_and_give_the_observed_points_back(count):
-    layout = Layout.of(trial(arc()), count)
+    layout = NodeLayout.of(trial(arc()), count)
     assert layout.places == pytest.approx(np.linspace(0, 0.2 * np.pi, count), rel=1e-4)
     radius = np.linalg.norm(layout.points - (0, 0.4, 0), axis=1)
     assert radius == pytest.approx(np.full(count, 0.4), abs=2e-5)
@@ -87,23 +87,23 @@ def test_nodes_lie_on_the_curve_and_give_the_observed_points_back(count):
 
 
 def test_a_trial_starts_at_rest_or_with_the_velocity_between_its_points():
-    assert not Layout.of(trial(arc()), 31).velocities.any()
+    assert not NodeLayout.of(trial(arc()), 31).velocities.any()
     points = arc()
     turning = np.cross((0, 0, 2.0), points)
-    layout = Layout.of(trial(points, velocity=turning), 47)
+    layout = NodeLayout.of(trial(points, velocity=turning), 47)
     assert layout.velocities == pytest.approx(np.cross((0, 0, 2.0), layout.points), abs=1e-4)
 
 
 def test_more_grips_than_nodes_are_refused():
     with pytest.raises(InputError) as refusal:
-        Layout.of(trial(arc(), (tuple(range(1, 20)),)), 20)
+        NodeLayout.of(trial(arc(), (tuple(range(1, 20)),)), 20)
     text = str(refusal.value)
     assert text.startswith("trial 't': got 19 gripped points, expected fewer than the 20 nodes; ")
-    assert len(Layout.of(trial(arc(), (tuple(range(1, 20)),)), 21).places) == 21
+    assert len(NodeLayout.of(trial(arc(), (tuple(range(1, 20)),)), 21).places) == 21
 
 
 def test_a_layout_is_read_only():
-    layout = Layout.of(trial(arc()), 31)
+    layout = NodeLayout.of(trial(arc()), 31)
     for array in (layout.places, layout.points, layout.velocities, layout.observe):
         with pytest.raises(ValueError):
             array[0] = 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, Trial
-from dlo_calibration.simulation.nodes import Layout
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rollout import roll_out, Settling
 
 STEP = 0.01
@@ -51,7 +51,7 @@ class Sinking:
 def rolled(hands, goals, until=np.inf, settling=None, nodes=11):
     actions = [Action(hand if isinstance(hand, tuple) else (hand,)) for hand in hands]
     trial = Trial('t', CHAIN, actions, goals)
-    layout = Layout.of(trial, nodes)
+    layout = NodeLayout.of(trial, nodes)
     return roll_out(trial, layout, Sinking(layout.points, until), settling or Settling())
 
 
