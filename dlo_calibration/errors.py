@@ -36,3 +36,9 @@ class InputError(DloCalibrationError):
 
 class SimulationError(DloCalibrationError):
     """A trial that an engine cannot simulate, or a rollout that diverged."""
+
+
+def unwritable(path: object, error: OSError) -> InputError:
+    """Return the error for a file that cannot be written."""
+    return InputError(f'file {path}', str(error), 'a place that can be written to',
+                      'choose another one with --output')

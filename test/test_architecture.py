@@ -33,7 +33,7 @@ ONLY = {
     'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
-NOT_LOADED = ('rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.optimize', 'cma')
+NOT_LOADED = ('jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))
 
@@ -106,7 +106,7 @@ def test_a_search_never_sees_a_trial():
 
 
 #: What takes long to load; then commands, and what of that each needs.
-SLOW = {'matplotlib', 'numba', 'pybullet', 'rclpy', 'scipy'}
+SLOW = {'jinja2', 'matplotlib', 'numba', 'pybullet', 'rclpy', 'scipy'}
 LOADED = (
     (('--help',), set()),
     (('info', 'msg_samples/object1'), set()),

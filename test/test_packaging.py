@@ -110,6 +110,7 @@ def test_wheel_has_the_commands_the_types_and_the_shared_files(sources, tmp_path
     assert all(f'{name} = ' in entry_points for name in EXECUTABLES)
     assert f'{NAME}/py.typed' in names
     assert f'{NAME}/search/__init__.py' in names
-    assert {str(file.relative_to(ROOT)) for file in (ROOT / NAME).rglob('*.xsd')} <= set(names)
+    assert {str(file.relative_to(ROOT)) for kind in ('xsd', 'html')
+            for file in (ROOT / NAME).rglob(f'*.{kind}')} <= set(names)
     assert any(name.endswith(f'share/{NAME}/package.xml') for name in names)
     assert not any(name.startswith('test') for name in names)

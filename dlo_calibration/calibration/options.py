@@ -16,13 +16,13 @@ from typing import Any, Iterator, Mapping
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.parameters import (
     BY_NAME,
-    measured,
     MOST_PARTS,
     PAPER_PARAMETERS,
     PARAMETERS,
     ParameterSpace,
     SCALE,
 )
+from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 

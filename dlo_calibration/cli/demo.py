@@ -21,14 +21,13 @@ import time
 from typing import Any, Callable, Iterator, Sequence
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.output import document
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.files.result import read_result
+from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import read_session, Session, session_trials
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
-from dlo_calibration.report import sentences, terminal
+from dlo_calibration.report import terminal
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.signals import StopFlag
@@ -83,13 +82,7 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
     used = Options.of(file.options)
     result = validated(file, session_trials(read_session(folder), used)[0], used)
     session_picture(result.trials, result.chains, output / PICTURE)
-    out.print(terminal.parameter_table(document(result)['parameters']))
-    out.print(terminal.facts_table('fit', [
-        *terminal.error_facts(result)[:4], ('evaluations', f'{file.evaluations} in {file.seconds:.1f} s'),
-        ('search', f'{file.search}, seed {file.seed}'), ('engine', file.engine),
-        ('ended', file.stop_reason)]))
-    for sentence in sentences.sentences(result):
-        out.print(sentence)
+    terminal.print_result(result, sys.stdout, {key: getattr(file, key) for key in HOW})
     out.print(f'session and result.xml: {folder}', soft_wrap=True)
     out.print(f'simulated chains on the measured ones: {output / PICTURE}', soft_wrap=True)
 

@@ -19,6 +19,7 @@ from dlo_calibration.cli.options import given_options
 from dlo_calibration.cli.output import print_result, tell
 from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.files.session import trial_records
@@ -88,13 +89,7 @@ def _make_folder(folder: Path, names: Sequence[str]) -> None:
 def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,
                  should_stop: Callable[[], bool]) -> None:
     """Write a result, and what it was found from, into a folder."""
-    from dlo_calibration.report.page import (
-        digests,
-        Origin,
-        repeating_command,
-        write_evaluations,
-        write_report,
-    )
+    from dlo_calibration.report.page import digests, Origin, repeating_command, write_report
 
     write_result(folder / RESULT, result, source.options.flat())
     _write_session(folder / SESSION, source)

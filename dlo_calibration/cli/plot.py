@@ -33,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Do what the verb says; return the exit code."""
-    from dlo_calibration.report.plot import write_animations, write_pictures
+    from dlo_calibration.report.animation import write_animations
+    from dlo_calibration.report.drawing import write_pictures
 
     if chosen.animation and chosen.result is None:
         raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',

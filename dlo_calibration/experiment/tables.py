@@ -13,17 +13,19 @@ from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.plain import known
 from dlo_calibration.experiment.outcome import Outcome
 from dlo_calibration.experiment.study import Task
 from dlo_calibration.experiment.summary import complete_runs, Findings, Spread
+from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
-from dlo_calibration.report.drawing import as_text, blank_figure, DOTS_PER_INCH, MILLIMETRES, unwritable
+from dlo_calibration.report.figure import as_text, blank_figure, BLUE, GREEN, PURPLE, write_figure, YELLOW
 
 UNKNOWN = 'not known to us'
 #: Figures of the paper: of its five objects, by the names of the samples that resemble them.
 PAPER_VALIDITY: Mapping[str, float] = {'object5': 53.0}
 PAPER_SCATTER = (10.0, 28.0)
-COLOURS = ('tab:blue', 'tab:orange', 'tab:green', 'tab:purple')
+COLOURS = (BLUE, YELLOW, GREEN, PURPLE)  # of searches
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def document(account: Account) -> dict[str, Any]:
     paper = {'validity': dict(PAPER_VALIDITY), 'scatter': list(PAPER_SCATTER)} if account.samples else None
     return {'command': account.command, 'engine': account.engine, 'runs': account.runs,
             'evaluations': account.evaluations, 'complete': account.complete,
-            'paper': paper, 'findings': [asdict(one) for one in account.findings]}
+            'paper': paper, 'findings': known([asdict(one) for one in account.findings])}
 
 
 def markdown(account: Account) -> str:
@@ -160,10 +162,7 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
         rows[0].plot([], [], 'o', color=COLOURS[which % len(COLOURS)], label=search)
     rows[0].plot([], [], 'x', color='0.6', label='the trials tell nothing: default')
     figure.legend(loc='outside upper center', ncols=len(searches) + 1, frameon=False)
-    try:
-        figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
-    except OSError as error:
-        raise unwritable(path, error) from error
+    write_figure(figure, path)
 
 
 def _consistency(findings: Sequence[Findings]) -> str:
@@ -174,7 +173,7 @@ def _consistency(findings: Sequence[Findings]) -> str:
         for name in names:
             spread = one.parameters.get(name)
             told = one.informed.get(name, 0)
-            mean, std = _number(_mean(spread), 1), _number(_std(spread), 2)
+            mean, std = number(_mean(spread)), number(_std(spread))
             if spread and not told:
                 mean, std = f'*{mean}*', f'*{std}*'
             elif spread and told < spread.count:
@@ -187,18 +186,17 @@ def _consistency(findings: Sequence[Findings]) -> str:
 
 def _validity(account: Account) -> str:
     head = ['object', 'search', 'score, average', 'standard deviation', 'very similar', 'worst action',
-            'mean error, mm', 'standard deviation', '% of length', 'fitted trials, mm', 'evaluations',
+            'mean error', 'standard deviation', '% of length', 'fitted trials', 'evaluations',
             'seconds']
     rows = []
     for one in account.findings:
         score, count = _mean(one.score), one.score.count if one.score else 0
-        shown = _number(score, 1)
+        shown = number(score)
         rows.append([
             one.subject, one.search, f'**{shown}**' if score is not None and score < VERY_SIMILAR else shown,
-            _number(_std(one.score), 2), f'{one.very_similar} of {count} runs', _number(one.worst, 1),
-            _number(_mean(one.error), 2, MILLIMETRES), _number(_std(one.error), 2, MILLIMETRES),
-            _number(_mean(one.share), 2), _number(_mean(one.fitted), 2, MILLIMETRES),
-            _number(_mean(one.evaluations), 0), _number(_mean(one.seconds), 1)])
+            number(_std(one.score)), f'{one.very_similar} of {count} runs', number(one.worst),
+            measured(_mean(one.error), 'm'), measured(_std(one.error), 'm'), number(_mean(one.share)),
+            measured(_mean(one.fitted), 'm'), number(_mean(one.evaluations)), number(_mean(one.seconds))])
     if account.samples:
         head.append('score in the paper')
         for row in rows:
@@ -218,11 +216,7 @@ def _actions(account: Account) -> str:
 
 
 def _both(spread: Spread | None) -> str:
-    return '-' if spread is None else f'{_number(spread.mean, 1)} ± {_number(spread.std, 1)}'
-
-
-def _number(value: float | None, digits: int, unit: float = 1.0) -> str:
-    return '-' if value is None else f'{value * unit:.{digits}f}'
+    return '-' if spread is None else f'{number(spread.mean)} ± {number(spread.std)}'
 
 
 def _mean(spread: Spread | None) -> float | None:

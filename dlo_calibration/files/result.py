@@ -16,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.xml import (
@@ -40,6 +41,8 @@ from dlo_calibration.model.score import PointErrors
 
 ROOT = 'dlo'
 WHAT = 'result file'
+#: Attributes of the calibration, in the order of the document.
+HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason')
 TOLERANCE = 1e-3  # relative, of a physical value that somebody rounded
 
 ESTIMATE_NUMBERS = ('value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')
@@ -89,17 +92,15 @@ class Description:
     @classmethod
     def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> Description:
         """Return the definition of the DLO that a calibration found."""
-        space = result.space
+        space, told = result.space, plain(result)
         fixed = {p.name: space.fixed.get(p.name, p.default) for p in space.parameters
                  if p.name not in result.parameters and (p.name != 'mass' or 'mass' in space.fixed)}
         return cls(
             parameters=result.parameters, mass=space.mass, fixed=fixed,
             length=result.length, chain=result.trials[0].initial, score=result.best.score,
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
-            errors=result.errors, search=result.search, engine=result.engine, seed=result.seed,
-            evaluations=len(result.evaluations), simulations=result.simulations, seconds=result.seconds,
-            stop_reason=result.stop_reason, options=options or {}, warnings=result.warnings,
-            confirmation=result.confirmation)
+            errors=result.errors, options=options or {}, warnings=result.warnings,
+            confirmation=result.confirmation, **{key: told[key] for key in HOW})
 
     @property
     def values(self) -> dict[str, float]:
@@ -132,14 +133,12 @@ def description_document(found: CalibrationResult | Description,
     for name, value in dlo.fixed.items():
         physical, unit = space.reported(name, value)
         add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)
-    calibration = add(root, 'calibration', search=dlo.search, engine=dlo.engine,
-                      seed='none' if dlo.seed is None else dlo.seed, evaluations=dlo.evaluations,
-                      simulations=dlo.simulations, seconds=dlo.seconds, stop_reason=dlo.stop_reason)
-    fit = add(calibration, 'fit', score=dlo.score, **asdict(dlo.errors))
-    for name, score in zip(dlo.trials, dlo.scores, strict=True):
-        add(fit, 'trial', name=name, score=score)
+    how = {key: getattr(dlo, key) for key in HOW}
+    calibration = add(root, 'calibration', **{key: 'none' if one is None else one
+                                              for key, one in how.items()})
+    _add_fit(calibration, 'fit', dlo, dlo.trials)
     if dlo.confirmation is not None:
-        _add_confirmation(calibration, dlo.confirmation, dlo.trials)
+        _add_fit(calibration, 'confirmation', dlo.confirmation, dlo.trials)
     add_options(calibration, 'options', dlo.options)
     warnings = add(calibration, 'warnings')
     for text in dlo.warnings:
@@ -208,9 +207,11 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
     return dlo
 
 
-def _add_confirmation(calibration: Any, found: Confirmation, trials: Sequence[str]) -> None:
-    element = add(calibration, 'confirmation', engine=found.engine, score=found.score,
-                  **asdict(found.errors), mean_distance=found.mean_distance, max_distance=found.max_distance)
+def _add_fit(calibration: Any, tag: str, found: Description | Confirmation, trials: Sequence[str]) -> None:
+    """Add how well it fits, in all and by trial: with one engine, or with a second one that confirms it."""
+    other = vars(found) if isinstance(found, Confirmation) else {}
+    element = add(calibration, tag, engine=other.get('engine'), score=found.score, **asdict(found.errors),
+                  mean_distance=other.get('mean_distance'), max_distance=other.get('max_distance'))
     for name, score in zip(trials, found.scores, strict=True):
         add(element, 'trial', name=name, score=score)
 

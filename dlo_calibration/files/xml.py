@@ -27,6 +27,7 @@ import numpy as np
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.quantity import exact
 
 VERSION = '1'  # of both kinds of document
 MAXIMUM_SIZE = 64 * 2**20  # bytes
@@ -126,14 +127,8 @@ def add(parent: Any, tag: str, **attributes: Any) -> Any:
 
 
 def text_of(value: Any) -> str:
-    """Return a value as text from which it can be read back exactly."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, (tuple, list)):
-        return ' '.join(text_of(one) for one in value)
-    if isinstance(value, (int, str)):
-        return NOT_XML.sub('\ufffd', str(value))
-    return repr(float(value))
+    """Return a value as text that XML can hold and from which it is read back exactly."""
+    return NOT_XML.sub('\ufffd', exact(value))
 
 
 def number(where: str, element: Any, name: str) -> float:

@@ -111,11 +111,6 @@ PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 
 
-def measured(value: float, unit: str) -> str:
-    """Return a physical value as people write it; a coefficient has no unit."""
-    return f'{value:.3g}' if unit == '1' else f'{value:.3g} {unit}'
-
-
 @dataclass(frozen=True)
 class ParameterSpace:
     """

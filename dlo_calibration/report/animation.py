@@ -7,22 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.errors import unwritable
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.quantity import number
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.report.drawing import (
-    add_legend,
-    as_text,
-    blank_figure,
-    hand_colours,
-    OBSERVED,
-    SIMULATED,
-    unwritable,
-    View,
-)
+from dlo_calibration.report.drawing import hand_colours, numbered, View
+from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.protocol import Simulator
 
 FRAME_RATE = 10  # 1/s; GIF counts time in 0.01 s
@@ -86,18 +80,36 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
     from matplotlib.animation import PillowWriter
 
     speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
-    scene = _Scene(trial, motion, speed)
     writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': f'{trial.name}, simulated'})
     try:
-        with writer.saving(scene.figure, str(path), DOTS_PER_INCH):
-            for time, chain in zip(motion.times, motion.chains, strict=True):
-                scene.show(float(time), chain, f't = {time:.2f} s')
-                writer.grab_frame()
-            scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
-            for _ in range(round(PAUSE * FRAME_RATE)):
-                writer.grab_frame()
+        with settings():
+            scene = _Scene(trial, motion, speed)
+            with writer.saving(scene.figure, str(path), DOTS_PER_INCH):
+                for time, chain in zip(motion.times, motion.chains, strict=True):
+                    scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
+                    writer.grab_frame()
+                scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
+                for _ in range(round(PAUSE * FRAME_RATE)):
+                    writer.grab_frame()
     except OSError as error:
         raise unwritable(path, error) from error
+
+
+def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],
+                     folder: Path, note: Callable[[str], None]) -> list[Path]:
+    """
+    Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is made.
+
+    :param physical: parameters by name (SI units).
+    :param note: called with the path of each file, once it is written.
+    :raises InputError: where a file cannot be written.
+    :raises SimulationError: where a trial cannot be simulated.
+    """
+    paths = numbered(trials, folder, '.gif')
+    for trial, path in zip(trials, paths, strict=True):
+        write_animation(trial, simulated_motion(trial, simulator, physical), path)
+        note(str(path))
+    return paths
 
 
 class _Scene:
@@ -106,14 +118,14 @@ class _Scene:
     def __init__(self, trial: Trial, motion: Motion, speed: float) -> None:
         self.figure = blank_figure(10.5, 4.8)
         self._trial = trial
-        self._speed = '' if speed < 1.05 else f', {speed:.1f} times as fast as in reality'
+        self._speed = '' if speed < 1.05 else f', {number(speed)} times as fast as in reality'
         self._colours = hand_colours([trial])
         self._moving: list[tuple[View, Any, Any, Mapping[str, Any]]] = []
         self._tracked = any(not goal.stable for goal in trial.goals)
         self._title = self.figure.suptitle(' ', fontweight='bold')
         axes = self.figure.subplots(1, 2)
         for one, above in zip(axes, (True, False), strict=True):
-            self._moving.append(self._prepare(View(one, trial, self._colours, above=above), motion))
+            self._moving.append(self._prepare(View(one, trial, above=above), motion))
         add_legend(self.figure, list(axes), columns=3)
         self.figure.draw_without_rendering()
         self.figure.set_layout_engine('none')  # else the axes would tremble

@@ -1,83 +1,165 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures: measured and simulated chains of a trial from above and from the side, and the errors."""
+"""Drawing: measured and simulated chains of a trial, and their errors, for a PNG, a GIF and the page."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+import math
 from pathlib import Path
-from typing import Any, Mapping, Sequence, TYPE_CHECKING
+from typing import Callable, Mapping, Sequence, TYPE_CHECKING
 
 import numpy as np
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import unwritable
+from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.inference.uncertainty import DEVIATIONS
+from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
+from dlo_calibration.report.figure import (
+    add_legend,
+    as_text,
+    BEFORE,
+    blank_figure,
+    BLUE,
+    FAINT,
+    GREEN,
+    OBSERVED,
+    Panel,
+    panel,
+    PURPLE,
+    settings,
+    SIMULATED,
+    SKY,
+    write_figure,
+    YELLOW,
+)
+from dlo_calibration.report.sentences import MEAN_DISTANCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
 
-PATH_SAMPLES = 60
-HAND_COLOURS = ('tab:green', 'tab:purple', 'tab:red', 'tab:pink', 'tab:brown', 'tab:olive', 'tab:cyan',
-                'tab:blue')
+HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99')
 INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # early to late
-OBSERVED, SIMULATED, BEFORE = 'black', 'tab:orange', '0.72'
-MILLIMETRES = 1e3
-DOTS_PER_INCH = 110
+PATH_SAMPLES = 60  # of a hand's path
+LINE_HEIGHT = 0.25  # in, of a legend
 LABEL_SIZE = (0.08, 0.06)  # from a label's point to its middle, relative to the size of what is drawn
-LINE_HEIGHT = 0.25  # in, of the legend
 
 
-def trial_picture(trial: Trial, chains: Floats | None, path: str | Path) -> None:
+@dataclass(frozen=True)
+class Drawn:
     """
-    Write a PNG of one trial: from above, from the side, and the error of each point.
+    A trial to draw, with what is known of how near the simulation should come.
 
-    :param chains: (g, n, 3) [m] simulated at the goals; None: observed only, with
-        how far each point moved in place of the error.
-    :raises InputError: where the file cannot be written.
+    :param chains: (g, n, 3) [m] simulated at the goals; None: nothing was simulated.
+    :param colours: of the hands, by name.
+    :param noise: standard deviation of a measured coordinate [m]; nan where it is not known.
+    :param band: (n,) [m] standard deviation of the simulated points, the largest of the goals that are shown;
+        None where it is not known.
     """
-    session_picture([trial], None if chains is None else [chains], path)
+
+    trial: Trial
+    chains: Floats | None
+    colours: Mapping[str, str]
+    noise: float = math.nan
+    band: Floats | None = None
+
+    @classmethod
+    def of(cls, result: CalibrationResult, k: int) -> Drawn:
+        """Return the k-th trial of a result."""
+        trial, found = result.trials[k], result.examination
+        band = None
+        if found is not None and found.regular:
+            by_goal = ResidualLayout.of(result.trials).by_point(found.band)[k]
+            band = by_goal[shown_goals(len(trial.goals))].max(axis=0)
+        return cls(trial, result.chains[k], hand_colours([trial]), math.nan if found is None else found.noise,
+                   band)
+
+    def goals(self) -> list[tuple[int, str | None]]:
+        """Return the goals to show; where there are several, each with a colour of its own."""
+        goals = shown_goals(len(self.trial.goals))
+        return [(goal, INSTANT_COLOURS[order] if len(goals) > 1 else None)
+                for order, goal in enumerate(goals)]
 
 
 def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, path: str | Path) -> None:
     """
-    Write a PNG with a row per trial, each as `trial_picture` draws it.
+    Write a PNG with a row per trial: from above, from the side, and the error of each point.
 
-    :param chains: of each trial, (g, n, 3) [m] simulated at its goals; None: observed only.
+    :param chains: of each trial, (g, n, 3) [m] simulated at its goals; None: observed only, with
+        how far each point moved in place of the error.
     :raises InputError: where the file cannot be written.
     """
-    figure = _figure(trials, chains)
+    colours = hand_colours(trials)
+    # Colours of instants are a trial's own, so each row explains them then.
+    several = any(len(trial.goals) > 1 for trial in trials)
+    lines = (2 + len(colours) + 2 * several) * (len(trials) if several else 1)
+    with settings():
+        figure = blank_figure(14, 4.3 * len(trials) + LINE_HEIGHT * lines)
+        rows = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
+        explained: list[Axes] = []
+        for k, (trial, row) in enumerate(zip(trials, rows, strict=True)):
+            drawn = Drawn(trial, None if chains is None else chains[k], colours)
+            row.suptitle(as_text(_title(drawn)), fontweight='bold')
+            above, side, error = row.subplots(1, 3)
+            draw_view(above, drawn, above=True)
+            draw_view(side, drawn, above=False)
+            draw_errors(error, drawn)
+            explained += [above, error]
+            if several:
+                add_legend(row, [above, error])
+        if not several:
+            add_legend(figure, explained)
+        write_figure(figure, path)
+
+
+def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,
+                   note: Callable[[str], None]) -> list[Path]:
+    """
+    Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is made; see `session_picture`.
+
+    :param note: called with the path of each file, once it is written.
+    :raises InputError: where a file cannot be written.
+    """
+    paths = numbered(trials, folder, '.png')
+    for k, (trial, path) in enumerate(zip(trials, paths, strict=True)):
+        session_picture([trial], None if chains is None else [chains[k]], path)
+        note(str(path))
+    return paths
+
+
+def numbered(trials: Sequence[Trial], folder: Path, suffix: str) -> list[Path]:
+    """Name a file for each trial by its number, as its name may be anything; make the folder."""
     try:
-        figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise unwritable(path, error) from error
+        raise unwritable(folder, error) from error
+    return [folder / f'trial_{k}{suffix}' for k in range(1, len(trials) + 1)]
 
 
-def unwritable(path: str | Path, error: OSError) -> InputError:
-    """Return the error for a picture that cannot be written."""
-    return InputError(f'file {path}', str(error), 'a place that can be written to',
-                      'choose another one with --output')
-
-
-def horizontal_direction(trial: Trial) -> Floats:
-    """Return the horizontal unit vector, (3,), along which a trial extends most."""
-    points = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])[:, :2]
-    direction = np.linalg.eigh(np.cov(points.T))[1][:, -1]
-    # The sign of an eigenvector is arbitrary; a picture of the same trial must not flip.
-    direction = direction * (1.0 if direction[np.argmax(np.abs(direction))] > 0 else -1.0)
-    return np.array([direction[0], direction[1], 0.0])
-
-
-def blank_figure(width: float, height: float) -> Figure:
-    """Return an empty figure [in] that never opens a window or is kept alive: there is no pyplot."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout='constrained')
-    FigureCanvasAgg(figure)
-    return figure
+def trial_panels(drawn: Drawn) -> list[Panel]:
+    """Draw a trial for the page: from above, from the side, the error of each point, and its direction."""
+    name, chains = drawn.trial.name, drawn.chains
+    assert chains is not None
+    off = residuals(drawn.trial, chains).reshape(chains.shape)
+    errors = PointErrors.of(off)
+    by_axis = (f'{axis}: {interval(values.min(), values.max(), "m")}'
+               for axis, values in zip('xyz', off[-1].T, strict=True))
+    return [
+        panel(lambda axes: draw_view(axes, drawn, above=True),
+              f'{name} seen from above: the measured and the simulated chain'),
+        panel(lambda axes: draw_view(axes, drawn, above=False),
+              f'{name} seen from the side: the measured and the simulated chain', legend=False),
+        panel(lambda axes: draw_errors(axes, drawn),
+              f'{name}, error of each point: the mean is {measured(errors.mean, "m")}, '
+              f'the largest {measured(errors.max, "m")}'),
+        panel(lambda axes: _draw_differences(axes, drawn),
+              f'{name}, simulated minus measured coordinates: {", ".join(by_axis)}')]
 
 
 def hand_colours(trials: Sequence[Trial]) -> Mapping[str, str]:
@@ -86,20 +168,9 @@ def hand_colours(trials: Sequence[Trial]) -> Mapping[str, str]:
     return {name: HAND_COLOURS[k % len(HAND_COLOURS)] for k, name in enumerate(names)}
 
 
-def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:
-    """Explain below the figure what is drawn in `axes`, everything once."""
-    shown: dict[str, Any] = {}
-    for one in axes:
-        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
-            shown.setdefault(label, handle)
-    figure.legend(list(shown.values()), list(shown), loc='outside lower center', frameon=False,
-                  ncols=min(columns, len(shown)))
-
-
-def as_text(name: str) -> str:
-    """Return a name so that it is written as it is: neither a formula nor a hidden label."""
-    shown = name.replace('$', r'\$')
-    return f' {shown}' if shown.startswith('_') else shown
+def hand_path(hand: Hand) -> Floats:
+    """Return (k, 3) [m] the way of a hand, from where it closes to its last waypoint."""
+    return hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, PATH_SAMPLES)))
 
 
 class View:
@@ -108,14 +179,12 @@ class View:
 
     :param above: look from above; else from the side, along the horizontal
         direction in which the trial extends least.
-    :param colours: of the hands, by name.
     """
 
-    def __init__(self, axes: Axes, trial: Trial, colours: Mapping[str, str], *, above: bool) -> None:
+    def __init__(self, axes: Axes, trial: Trial, *, above: bool) -> None:
         self.axes = axes
-        self._trial = trial
-        self._colours = colours
-        across = horizontal_direction(trial)
+        self.trial = trial
+        across = _horizontal_direction(trial)
         self._projection = np.array([[1.0, 0, 0], [0, 1.0, 0]] if above else [across, [0, 0, 1.0]])
         if above:
             axes.set(title='seen from above', xlabel='x [m]', ylabel='y [m]')
@@ -134,34 +203,33 @@ class View:
 
     def draw_start(self) -> None:
         """Draw the DLO before the action."""
-        self.axes.plot(*self.flat(self._trial.initial.points), '-', color=BEFORE, linewidth=3,
+        self.axes.plot(*self.flat(self.trial.initial.points), '-', color=BEFORE, linewidth=3,
                        label='before the action, measured', zorder=1)
 
-    def draw_goal(self, index: int, simulated: Floats | None, colour: str | None = None) -> None:
+    def draw_goal(self, index: int, simulated: Floats | None, colour: str | None) -> None:
         """
         Draw a goal.
 
         :param simulated: (n, 3) [m]; None where nothing was.
         :param colour: of this one among several goals; None: it is the only one.
         """
-        goal = self._trial.goals[index]
-        measured = self.flat(goal.chain.points)
-        when = 'after the action' if colour is None else f'after {goal.time:.2f} s'
-        self.axes.plot(*measured, 'o', color=colour or OBSERVED, markersize=4.5, linestyle='none',
+        goal = self.trial.goals[index]
+        seen = self.flat(goal.chain.points)
+        when = 'after the action' if colour is None else f'after {number(goal.time)} s'
+        self.axes.plot(*seen, 'o', color=colour or OBSERVED, markersize=4.5, linestyle='none',
                        label=f'{when}, measured', zorder=3)
         if simulated is None:
             return
         shown = self.flat(simulated)
         self.axes.plot(*shown, '-', color=colour or SIMULATED, linewidth=2, zorder=2,
                        label=f'{when}, simulated')
-        for k in range(measured.shape[1]):
-            self.axes.plot(*np.stack([measured[:, k], shown[:, k]], axis=1), '-', zorder=2, linewidth=0.7,
-                           color=colour or SIMULATED, alpha=0.6,
-                           label=None if colour else 'one point, measured and simulated')
+        pairs = np.stack([seen, shown, np.full(seen.shape, np.nan)], axis=2).reshape(2, -1)
+        self.axes.plot(*pairs, '-', zorder=2, linewidth=0.7, color=colour or SIMULATED, alpha=0.6,
+                       label=None if colour else 'one point, measured and simulated')
 
     def draw_first_point(self) -> None:
         """Name the point at which the DLO begins."""
-        chains = [self._trial.initial, *(goal.chain for goal in self._trial.goals)]
+        chains = [self.trial.initial, *(goal.chain for goal in self.trial.goals)]
         shown = np.concatenate([self.flat(chain.points).T for chain in chains])
         first = shown[0]
 
@@ -175,11 +243,10 @@ class View:
             fontsize='small', color='0.3', ha='left' if right > 0 else 'right',
             va='bottom' if up > 0 else 'top', zorder=1)
 
-    def draw_hands(self) -> None:
+    def draw_hands(self, colours: Mapping[str, str]) -> None:
         """Draw where hands close, move and open."""
-        for hand in self._trial.hands:
-            colour = self._colours[hand.name]
-            path = hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, PATH_SAMPLES)))
+        for hand in self.trial.hands:
+            colour, path = colours[hand.name], hand_path(hand)
             self.axes.plot(*self.flat(path), '--', color=colour, linewidth=1, zorder=4)
             self.axes.plot(*self.flat(path[:1]), 's', color=colour, markersize=6, zorder=4, linestyle='none',
                            label=as_text(f'{hand.name} closes'))
@@ -187,70 +254,79 @@ class View:
                            label=as_text(f'{hand.name} at its last waypoint'))
 
 
-def _figure(trials: Sequence[Trial], chains: Sequence[Floats] | None) -> Figure:
-    colours = hand_colours(trials)
-    # Colours of instants are a trial's own, so each row explains them then.
-    several = any(len(trial.goals) > 1 for trial in trials)
-    lines = (1 + len(colours) + 2 * several) * (len(trials) if several else 1)
-    figure = blank_figure(14, 4.3 * len(trials) + LINE_HEIGHT * lines)
-    rows = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
-    drawn: list[Axes] = []
-    for k, (trial, row) in enumerate(zip(trials, rows, strict=True)):
-        simulated = None if chains is None else chains[k]
-        row.suptitle(as_text(_title(trial, simulated)), fontweight='bold')
-        above, side, error = row.subplots(1, 3)
-        for axes, from_above in ((above, True), (side, False)):
-            _draw_view(View(axes, trial, colours, above=from_above), trial, simulated)
-        _draw_errors(error, trial, simulated, colours)
-        drawn += [above, error]
-        if several:
-            add_legend(row, [above, error])
-    if not several:
-        add_legend(figure, drawn)
-    return figure
-
-
-def _title(trial: Trial, chains: Floats | None) -> str:
-    if chains is None:
-        return f'{trial.name}, as it was measured'
-    errors = PointErrors.of(residuals(trial, chains))
-    share = 100 * errors.mean / trial.initial.length
-    return (f'{trial.name}: simulated points are {errors.mean * MILLIMETRES:.1f} mm from the measured ones '
-            f'on average ({share:.1f} % of the length), {errors.max * MILLIMETRES:.1f} mm at most')
-
-
-def _coloured_goals(trial: Trial) -> list[tuple[int, str | None]]:
-    """Return the goals to show; where there are several, each with a colour of its own."""
-    goals = shown_goals(len(trial.goals))
-    return [(goal, INSTANT_COLOURS[order] if len(goals) > 1 else None) for order, goal in enumerate(goals)]
-
-
-def _draw_view(view: View, trial: Trial, chains: Floats | None) -> None:
+def draw_view(axes: Axes, drawn: Drawn, *, above: bool) -> None:
+    """Draw a trial from one side."""
+    view = View(axes, drawn.trial, above=above)
     view.draw_start()
-    for goal, colour in _coloured_goals(trial):
-        view.draw_goal(goal, None if chains is None else chains[goal], colour)
-    view.draw_hands()
+    for goal, colour in drawn.goals():
+        view.draw_goal(goal, None if drawn.chains is None else drawn.chains[goal], colour)
+    view.draw_hands(drawn.colours)
     view.draw_first_point()
 
 
-def _draw_errors(axes: Axes, trial: Trial, chains: Floats | None, colours: Mapping[str, str]) -> None:
-    """Draw the error of each point; without simulation, how far each has moved."""
+def draw_errors(axes: Axes, drawn: Drawn) -> None:
+    """Draw the error of each point, and how large it should be; without simulation, how far each moved."""
+    trial, chains = drawn.trial, drawn.chains
     places = trial.initial.arc_lengths()
-    for goal, colour in _coloured_goals(trial):
-        measured = trial.goals[goal].chain.points
+    for goal, colour in drawn.goals():
+        seen = trial.goals[goal].chain.points
         other = trial.initial.points if chains is None else chains[goal]
-        distances = np.linalg.norm(measured - other, axis=1) * MILLIMETRES
-        axes.plot(places, distances, 'o-', markersize=4, linewidth=1,
-                  color=colour or (OBSERVED if chains is None else SIMULATED))
+        axes.plot(places, np.linalg.norm(seen - other, axis=1) * 1e3, 'o-', markersize=4, linewidth=1,
+                  color=colour or (OBSERVED if chains is None else SIMULATED),
+                  label=None if colour is None else f'after {number(trial.goals[goal].time)} s')
     if chains is not None:
-        mean = PointErrors.of(residuals(trial, chains)).mean * MILLIMETRES
-        axes.axhline(mean, color='0.4', linestyle=':', label='mean error')
+        mean = PointErrors.of(residuals(trial, chains)).mean * 1e3
+        axes.axhline(mean, color=SIMULATED, linestyle=':', linewidth=1.2, label='mean error')
+    if math.isfinite(drawn.noise):
+        axes.axhline(drawn.noise * MEAN_DISTANCE * 1e3, color=FAINT, linestyle=(0, (6, 3)), linewidth=1.2,
+                     label='error that the noise of the measured points alone would give')
+    if drawn.band is not None:
+        axes.fill_between(places, 0.0, drawn.band * 1e3, color=BLUE, alpha=0.25, linewidth=0, label=(
+            'how far a simulated point may lie elsewhere, given how well the parameters are known '
+            '(one standard deviation)'))
     for hand in trial.hands:
-        for grip in hand.grips:
-            axes.axvline(places[grip], color=colours[hand.name], linestyle='--', linewidth=1,
-                         label=as_text(f'point that {hand.name} grips'))
+        for k, grip in enumerate(hand.grips):
+            axes.axvline(places[grip], color=drawn.colours[hand.name], linestyle='--', linewidth=1,
+                         label=None if k else as_text(f'point that {hand.name} grips'))
     axes.set(xlabel='place along the DLO, from its first point [m]',
              ylabel='distance [mm]' if chains is None else 'distance from measured to simulated [mm]',
              title='how far each point moved' if chains is None else 'error of each point')
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
+
+
+def _draw_differences(axes: Axes, drawn: Drawn) -> None:
+    """Draw along which axis the simulated points of the last goal are off."""
+    trial, goal = drawn.trial, drawn.trial.goals[-1]
+    assert drawn.chains is not None
+    places = trial.initial.arc_lengths()
+    if math.isfinite(drawn.noise):
+        reach = DEVIATIONS * drawn.noise * 1e3
+        axes.axhspan(-reach, reach, color=FAINT, alpha=0.25, linewidth=0,
+                     label='noise of the measured points (90 % of it)')
+    for axis, values, colour, dashes in zip(
+            ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.points).T, (BLUE, YELLOW, GREEN),
+            ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
+        axes.plot(places, values * 1e3, color=colour, linestyle=dashes, linewidth=1.8, label=f'in {axis}')
+    last = '' if len(trial.goals) == 1 else f', after {number(goal.time)} s'
+    axes.set(xlabel='place along the DLO, from its first point [m]', ylabel='difference [mm]',
+             title=f'simulated minus measured{last}')
+    axes.grid(alpha=0.3)
+
+
+def _title(drawn: Drawn) -> str:
+    if drawn.chains is None:
+        return f'{drawn.trial.name}, as it was measured'
+    errors = PointErrors.of(residuals(drawn.trial, drawn.chains))
+    return (f'{drawn.trial.name}: simulated points are {measured(errors.mean, "m")} from the measured ones '
+            f'on average ({number(100 * errors.mean / drawn.trial.initial.length)} % of the length), '
+            f'{measured(errors.max, "m")} at most')
+
+
+def _horizontal_direction(trial: Trial) -> Floats:
+    """Return the horizontal unit vector, (3,), along which a trial extends most."""
+    points = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])[:, :2]
+    direction = np.linalg.eigh(np.cov(points.T))[1][:, -1]
+    # The sign of an eigenvector is arbitrary; a picture of the same trial must not flip.
+    direction = direction * (1.0 if direction[np.argmax(np.abs(direction))] > 0 else -1.0)
+    return np.array([direction[0], direction[1], 0.0])

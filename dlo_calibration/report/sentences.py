@@ -1,12 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Findings: what a calibration's result says to a person, in sentences, and as plain values for files."""
+"""Sentences: what a calibration's result says to a person."""
 
 from __future__ import annotations
-
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +12,10 @@ from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import silent
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME, PER_WEIGHT, SCALE
+from dlo_calibration.model.quantity import interval, measured, number
 
-MEAN_DISTANCE = float(np.sqrt(8 / np.pi))  # of white noise in three coordinates, in its standard deviations
+#: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
+MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
 
 
 def sentences(result: CalibrationResult) -> list[str]:
@@ -25,69 +24,21 @@ def sentences(result: CalibrationResult) -> list[str]:
             *_unexplained(result)]
 
 
-def physical_text(value: float, unit: str) -> str:
-    """Return a physical value with its unit as people write it; lengths in mm."""
-    shown, unit = _shown([value], unit)
-    return f'{shown[0]}{unit}'
-
-
-def interval_text(lower: float, upper: float, unit: str) -> str:
-    """Return a physical interval with its unit as people write it."""
-    shown, unit = _shown([lower, upper], unit)
-    return f'{" to ".join(shown)}{unit}'
-
-
-def _shown(values: list[float], unit: str) -> tuple[list[str], str]:
-    """Return the texts of values, and what to write after them."""
-    if unit == 'm':
-        return [plain(1e3 * value) for value in values], ' mm'
-    return [plain(value) for value in values], '' if unit == '1' else f' {unit}'
-
-
-def plain(value: float) -> str:
-    """Return a number with three digits that count; with a power of ten only where it is very large."""
-    if value == 0 or 1e-6 <= abs(value) < 1e6:
-        return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
-    return f'{value:.2e}'
-
-
-def values(result: CalibrationResult) -> dict[str, Any]:
-    """Return what was examined as plain values, lengths in m; None where it was not."""
-    found = result.examination
-    names = result.space.free
-    correlations = None
-    if found is not None and found.regular and found.uncertainty.correlations is not None:
-        correlations = {one: dict(zip(names, map(float, row), strict=True))
-                        for one, row in zip(names, found.uncertainty.correlations, strict=True)}
-    advice = None
-    if result.advice is not None:
-        advice = {**asdict(result.advice),
-                  **{key: getattr(result.advice, key) * SCALE
-                     for key in ('std', 'expected_std', 'lower', 'upper')}}
-    return {
-        'cross_validated_error_m': None if found is None else found.cross_validated,
-        'default_error_m': None if found is None else found.default_error,
-        'noise_m': None if found is None else found.noise,
-        'residual_std_m': None if found is None else found.uncertainty.residual,
-        'correlations': correlations, 'undetermined': list(result.undetermined), 'advice': advice,
-        'explanations': {one.name: one.share for one in result.missing_parameters}}
-
-
 def _known(result: CalibrationResult) -> list[str]:
     """Say of each parameter what it is, those known best first."""
     found: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
     for name, p in result.parameters.items():
         verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
         quantity = BY_NAME[name].quantity
-        value = physical_text(p.physical_value, p.physical_unit)
-        interval = interval_text(p.physical_lower, p.physical_upper, p.physical_unit)
+        value = measured(p.physical_value, p.physical_unit)
+        ends = interval(p.physical_lower, p.physical_upper, p.physical_unit)
         if verdict == NOT_IDENTIFIABLE:
             words = f'{name} could not be told'
             words += f' ({p.note}): {quantity} {value}' if p.note else \
-                f': with these trials, {quantity} may be anything from {interval}'
+                f': with these trials, {quantity} may be anything from {ends}'
         else:
             well = 'well' if verdict == IDENTIFIABLE else 'only roughly'
-            words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {interval}'
+            words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {ends}'
             words += f' ({p.note})' if p.note else ''
         found[verdict].append(f'{words}.')
     told = [text for group in found.values() for text in group]
@@ -116,25 +67,25 @@ def _advice(result: CalibrationResult) -> list[str]:
     if one is None:
         return []
     return [f'To know {one.parameter} better, {one.words} (action {one.action}). On the scale from 0 to '
-            f'100, that should bring its standard deviation from {one.std * SCALE:.1f} to '
-            f'{one.expected_std * SCALE:.1f}.']
+            f'100, that should bring its standard deviation from {number(one.std * SCALE)} to '
+            f'{number(one.expected_std * SCALE)}.']
 
 
 def _fit(result: CalibrationResult) -> list[str]:
     """Say how well it fits, and what that means."""
     found, mean = result.examination, result.errors.mean
-    words = [f'The simulated points are {mean * 1e3:.2f} mm from the measured ones on average '
-             f'({100 * mean / result.length:.2f} % of the length).']
+    words = [f'The simulated points are {measured(mean, "m")} from the measured ones on average '
+             f'({number(100 * mean / result.length)} % of the length).']
     if found is None:
         return words
     if np.isfinite(found.default_error):
-        words.append(f'With the default parameters they would be {found.default_error * 1e3:.2f} mm away.')
+        words.append(f'With the default parameters they would be {measured(found.default_error, "m")} away.')
     if np.isfinite(found.cross_validated):
         words.append('A trial that is left out of the fit is predicted to '
-                     f'{found.cross_validated * 1e3:.2f} mm.')
+                     f'{measured(found.cross_validated, "m")}.')
     noise = found.noise * MEAN_DISTANCE
     if np.isfinite(noise):
-        words.append(f'The noise of the measured points alone gives {noise * 1e3:.2f} mm; ' + (
+        words.append(f'The noise of the measured points alone gives {measured(noise, "m")}; ' + (
             'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
             'the rest is what the model, or the recorded path of a hand, does not explain.'))
     return [' '.join(words)]
@@ -142,7 +93,7 @@ def _fit(result: CalibrationResult) -> list[str]:
 
 def _unexplained(result: CalibrationResult) -> list[str]:
     """Say what to calibrate, too."""
-    shares = [f'{one.name} {100 * one.share:.0f} %' for one in result.missing_parameters]
+    shares = [f'{one.name} {number(100 * one.share)} %' for one in result.missing_parameters]
     if not shares:
         return []
     names = [one.name for one in result.missing_parameters if one.name != PARTS]

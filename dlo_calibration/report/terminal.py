@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, Iterable, Mapping, Sequence, TextIO
 
 from rich.console import Console
@@ -12,8 +13,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report import sentences
 
@@ -57,7 +60,7 @@ class SearchBar:
     def move(self, count: int, best: float) -> None:
         """Show that `count` evaluations were tried, and the best score of them."""
         self._best = best
-        self._progress.update(self._task, completed=count, best=f'{best:.1f}' if best < float('inf') else '-')
+        self._progress.update(self._task, completed=count, best=number(best))
 
 
 class TaskBar:
@@ -89,22 +92,17 @@ class TaskBar:
         self._progress.advance(self._task)
 
 
-def number(value: float | None, digits: int = 4) -> str:
-    """Return a number as people read it; a dash for none."""
-    return '-' if value is None else f'{value:.{digits}g}'
-
-
 def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return a table of parameters in both units; rows as in the JSON document."""
+    """Return a table of parameters in both units; rows as in the plain values of a result."""
     table = Table(title='parameters')
-    for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'unit', 'verdict'):
-        table.add_column(title, justify='left' if title in ('parameter', 'unit', 'verdict') else 'right')
+    for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'verdict'):
+        table.add_column(title, justify='left' if title in ('parameter', 'verdict') else 'right')
     for name, row in parameters.items():
+        unit = row['physical_unit']
         table.add_row(
-            escape(name), f"{row['value']:.1f}", f"{row['lower']:.1f} .. {row['upper']:.1f}",
-            number(row['physical_value']),
-            f"{number(row['physical_lower'], 2)} .. {number(row['physical_upper'], 2)}",
-            escape(row['physical_unit']), row['verdict'])
+            escape(name), number(row['value']), interval(row['lower'], row['upper'], '1'),
+            escape(measured(row['physical_value'], unit)),
+            escape(interval(row['physical_lower'], row['physical_upper'], unit)), row['verdict'])
     return table
 
 
@@ -126,42 +124,41 @@ def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -
     return table
 
 
-def error_facts(result: CalibrationResult) -> list[tuple[str, str]]:
-    """Return how well the simulated chains fit, and how that was found, in words."""
-    errors = result.errors
-    return [
-        ('difference score', f'{result.best.score:.1f} cm (below {SIMILAR:g}: similar, '
+def fit_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return how well the simulated chains fit, and how that was found, from the plain values of a result."""
+    facts = [
+        ('difference score', f'{number(told["score"])} cm (below {SIMILAR:g}: similar, '
                              f'below {VERY_SIMILAR:g}: very similar)'),
-        ('mean error', f'{errors.mean * 1e3:.2f} mm '
-                       f'({100 * errors.mean / result.length:.2f} % of the length)'),
-        ('rms / max error', f'{errors.rms * 1e3:.2f} / {errors.max * 1e3:.2f} mm'),
-        ('trials', str(len(result.trials))),
-        ('evaluations', f'{len(result.evaluations)} ({result.simulations} simulations) '
-                        f'in {result.seconds:.1f} s'),
-        ('search', f'{result.search or "-"}, seed {"-" if result.seed is None else result.seed}'),
-        ('engine', result.engine),
-        *_confirmation_facts(result),
-        ('ended', result.stop_reason),
-    ]
+        ('mean error', f'{measured(told["mean_error_m"], "m")} '
+                       f'({number(told["error_percent_of_length"])} % of the length)'),
+        ('rms error', measured(told['rms_error_m'], 'm')),
+        ('largest error', measured(told['max_error_m'], 'm')),
+        ('trials', str(told['trials'])),
+        ('evaluations', f'{told["evaluations"]} ({told["simulations"]} simulations) '
+                        f'in {number(told["seconds"])} s'),
+        ('search', f'{told["search"] or "-"}, seed {"-" if told["seed"] is None else told["seed"]}'),
+        ('engine', told['engine'])]
+    other = told['confirmation']
+    if other is not None:
+        facts.append((
+            f'confirmed by {other["engine"]}',
+            f'difference score {number(other["score"])} cm, '
+            f'mean error {measured(other["mean_error_m"], "m")}; '
+            f'points {measured(other["mean_distance_m"], "m")} from those of {told["engine"]}, '
+            f'{measured(other["max_distance_m"], "m")} at most'))
+    return [*facts, ('ended', told['stop_reason'])]
 
 
-def _confirmation_facts(result: CalibrationResult) -> list[tuple[str, str]]:
-    """Return what a second engine gave for the same parameters, if one was asked."""
-    other = result.confirmation
-    if other is None:
-        return []
-    return [(f'confirmed by {other.engine}',
-             f'difference score {other.score:.1f} cm, mean error {other.errors.mean * 1e3:.2f} mm; '
-             f'points {other.mean_distance * 1e3:.2f} mm from those of {result.engine}, '
-             f'{other.max_distance * 1e3:.2f} mm at most')]
+def print_result(result: CalibrationResult, stream: TextIO,
+                 how: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """
+    Print tables of the parameters and of the fit, and what the result says in sentences.
 
-
-def print_result(result: CalibrationResult, parameters: Mapping[str, Mapping[str, Any]],
-                 stream: TextIO) -> None:
-    """Print tables of the parameters and of the errors, and what the trials could not tell."""
-    out = console(stream)
-    out.print(parameter_table(parameters))
-    out.print(facts_table('fit', error_facts(result)))
+    :param how: plain values that take the place of the result's own.
+    """
+    out, told = console(stream), {**plain(result), **how}
+    out.print(parameter_table(told['parameters']))
+    out.print(facts_table('fit', fit_facts(told)))
     for sentence in sentences.sentences(result):
         out.print(escape(sentence))
 
@@ -171,17 +168,18 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     out = console(stream)
     out.print(facts_table(about['session'], [
         ('trials', str(len(about['trials']))),
-        ('duration', f"{about['duration_s']:.1f} s"),
+        ('duration', f"{number(about['duration_s'])} s"),
         ('frame', ', '.join(map(repr, about['frames'])) or '-'),
         *((topic, f'{count} messages') for topic, count in about['messages'].items()),
     ]))
     if about['trials']:
         head = ('name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')
         out.print(rows_table('trials', head, [
-            (trial['name'], str(trial['points']), f"{trial['length_m']:.3f} m",
+            (trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
              ', '.join(f"{hand['name']} (points {' '.join(map(str, hand['grips']))})"
                        for hand in trial['hands']),
-             f"{trial['stable_goals']} stable, {trial['timed_goals']} timed", f"{trial['duration_s']:.2f} s",
+             f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
+             f"{number(trial['duration_s'])} s",
              ', '.join(word for word, there in (
                  ('hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} features", trial['annotated_features'])) if there) or '-')

@@ -8,12 +8,12 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import MessageTypes
-from dlo_calibration.model.parameters import measured
+from dlo_calibration.model.quantity import exact, interval, measured, number
 from dlo_calibration.report import sentences
 
 OUTPUT_TYPES: Mapping[str, str] = {
@@ -27,6 +27,8 @@ STATES = ('collecting', 'calibrating', 'done', 'failed')
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 VALUE_UNIT = '0..100'  # of value, std, lower and upper of a result
 WHOLE = 'calibration'  # name of the status that speaks of the whole result
+#: Plain values that have a status or keys of their own, or are too long for a message.
+NOT_TOLD = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
 
 
 def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: Evaluation, evaluations: int,
@@ -47,63 +49,44 @@ def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: E
         'simulations_per_second': simulations_per_second, 'seconds_left': seconds_left}
     if evaluation.failure:
         values['failure'] = evaluation.failure
-    message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {best.score:.1f}, '
-               f'{seconds_left:.0f} s left')
+    message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {number(best.score)}, '
+               f'{number(seconds_left)} s left')
     level = WARN if evaluation.failure else OK
     return _diagnostics(types, stamp, [_status(types, level, 'progress', message, values)])
 
 
 def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
     """Build the message with the final parameter set: one status per parameter, one for the whole."""
+    told = plain(found)
     statuses = []
-    for name, p in found.parameters.items():
-        message = (f'{p.value:.1f} ({p.lower:.1f} to {p.upper:.1f}), '
-                   f'{measured(p.physical_value, p.physical_unit)}')
-        if not p.identifiable:
-            message += f'; {p.verdict or "the trials could not tell it"}'
-        statuses.append(_status(types, OK if p.identifiable else WARN, name, message, {
-            'value': p.value, 'std': p.std, 'lower': p.lower, 'upper': p.upper, 'unit': VALUE_UNIT,
-            'physical_value': p.physical_value, 'physical_lower': p.physical_lower,
-            'physical_upper': p.physical_upper, 'physical_unit': p.physical_unit,
-            'identifiable': p.identifiable, 'verdict': p.verdict, 'note': p.note}))
-    errors = found.errors
+    for name, row in told['parameters'].items():
+        message = (f'{number(row["value"])} ({interval(row["lower"], row["upper"], "1")}), '
+                   f'{measured(row["physical_value"], row["physical_unit"])}')
+        if not row['identifiable']:
+            message += f'; {row["verdict"] or "the trials could not tell it"}'
+        scale = {key: row.pop(key) for key in ('value', 'std', 'lower', 'upper')}
+        statuses.append(_status(types, OK if row['identifiable'] else WARN, name, message,
+                                {**scale, 'unit': VALUE_UNIT, **row}))
     statuses.append(_status(
         types, WARN if found.warnings else OK, WHOLE,
-        f'score {found.best.score:.1f}, mean error {errors.mean * 1e3:.2f} mm; {found.stop_reason}', {
-            'score': found.best.score, 'scores': ' '.join(repr(float(s)) for s in found.best.scores),
-            'mean_error_mm': errors.mean * 1e3, 'rms_error_mm': errors.rms * 1e3,
-            'max_error_mm': errors.max * 1e3, 'mean_abs_error_mm': errors.mean_abs * 1e3,
-            'error_percent_of_length': 100 * errors.mean / found.length,
-            'trials': len(found.trials), 'evaluations': len(found.evaluations),
-            'simulations': found.simulations, 'seconds': found.seconds, 'engine': found.engine,
-            'search': found.search, 'seed': '' if found.seed is None else found.seed,
-            'stop_reason': found.stop_reason, 'warnings': '; '.join(found.warnings),
-            **_examination(found), **_confirmation(found.confirmation)}))
+        f'score {number(found.best.score)}, mean error {measured(found.errors.mean, "m")}; '
+        f'{found.stop_reason}',
+        {**_pairs({key: told[key] for key in told if key not in NOT_TOLD}),
+         'findings': ' '.join(sentences.sentences(found)),
+         **_pairs(told['confirmation'] or {}, 'confirmation_')}))
     return _diagnostics(types, stamp, statuses)
 
 
-def _examination(found: CalibrationResult) -> dict[str, Any]:
-    """Return what was found around the parameters; empty values where it was not examined."""
-    examined = sentences.values(found)
-    lengths = {f'{key.removesuffix("_m")}_mm': '' if examined[key] is None else 1e3 * examined[key]
-               for key in ('cross_validated_error_m', 'default_error_m', 'noise_m', 'residual_std_m')}
-    return {**lengths, 'undetermined': '; '.join(found.undetermined),
-            'findings': ' '.join(sentences.sentences(found))}
-
-
-def _confirmation(found: Confirmation | None) -> dict[str, Any]:
-    """Return what a second engine gave for the same parameters; nothing where none was asked."""
-    if found is None:
-        return {}
-    return {
-        'confirmation_engine': found.engine, 'confirmation_score': found.score,
-        'confirmation_scores': ' '.join(repr(float(s)) for s in found.scores),
-        'confirmation_mean_error_mm': found.errors.mean * 1e3,
-        'confirmation_rms_error_mm': found.errors.rms * 1e3,
-        'confirmation_max_error_mm': found.errors.max * 1e3,
-        'confirmation_mean_abs_error_mm': found.errors.mean_abs * 1e3,
-        'confirmation_mean_distance_mm': found.mean_distance * 1e3,
-        'confirmation_max_distance_mm': found.max_distance * 1e3}
+def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Return plain values as a message has them: lengths in mm, texts joined by '; ', '' for None."""
+    pairs = {}
+    for key, value in told.items():
+        if key.endswith('_m'):
+            key, value = f'{key}m', None if value is None else value * 1e3
+        if key in ('warnings', 'undetermined'):
+            value = '; '.join(value)
+        pairs[f'{prefix}{key}'] = '' if value is None else value
+    return pairs
 
 
 def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
@@ -149,14 +132,7 @@ def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> An
 
 
 def _status(types: MessageTypes, level: int, name: str, message: str, values: Mapping[str, Any]) -> Any:
-    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=_text(value))
+    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=exact(value))
              for key, value in values.items()]
     return types.build('diagnostic_msgs/msg/DiagnosticStatus', level=types.level(level), name=name,
                        message=message, hardware_id='', values=pairs)
-
-
-def _text(value: Any) -> str:
-    """Return text that reads back exactly."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    return repr(float(value)) if isinstance(value, float) else str(value)

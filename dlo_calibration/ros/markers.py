@@ -13,15 +13,16 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
+from dlo_calibration.report.drawing import hand_path
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9  # visualization_msgs/Marker
 ADD, DELETE_ALL = 0, 3
 
 MOST_POINTS = 200  # of a chain or path; more are not to be told apart
-PATH_SAMPLES = 40
 THICKNESS = 0.01  # of a line, relative to the length of the DLO
 #: Error [share of the DLO's length] that is shown all red; half of it is yellow, none is green.
 RED_ERROR = 0.03
@@ -70,37 +71,37 @@ def _same(trial: Trial, other: Trial) -> bool:
 def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
     yield brush.line('initial', 0, trial.initial.points, INITIAL_COLOUR)
     for goal in shown_goals(len(trial.goals)):
-        measured = trial.goals[goal].chain.points
-        yield brush.spheres('goal', 2 * goal, measured, [GOAL_COLOUR], 1.2)
-        yield brush.line('goal', 2 * goal + 1, measured, GOAL_COLOUR, 0.5)
+        points = trial.goals[goal].chain.points
+        yield brush.spheres('goal', 2 * goal, points, [GOAL_COLOUR], 1.2)
+        yield brush.line('goal', 2 * goal + 1, points, GOAL_COLOUR, 0.5)
         if chains is not None:
             yield brush.line('simulated', goal, chains[goal], SIMULATED_COLOUR)
-            yield from _error_markers(brush, goal, measured, chains[goal], trial.initial.length)
+            yield from _error_markers(brush, goal, points, chains[goal], trial.initial.length)
     for place, hand in enumerate(trial.hands):
         yield from _hand_markers(brush, 3 * place, hand, HAND_COLOURS[place % len(HAND_COLOURS)], trial)
     text = trial.name
     if chains is not None:
         errors = PointErrors.of(residuals(trial, chains))
-        text += f': mean error {errors.mean * 1e3:.1f} mm, max {errors.max * 1e3:.1f} mm'
+        text += f': mean error {measured(errors.mean, "m")}, max {measured(errors.max, "m")}'
     # Trials happen in the same place; their labels are stacked.
     above = [0.0, 0.0, brush.thickness * (6 + 5 * k)]
     yield brush.label('label', 0, trial.initial.points[0] + above, text)
 
 
-def _error_markers(brush: _Brush, goal: int, measured: Floats, simulated: Floats,
+def _error_markers(brush: _Brush, goal: int, points: Floats, simulated: Floats,
                    length: float) -> Iterator[Any]:
     """Show the error of each point: a sphere where it was simulated, and a line to where it was."""
     colours = [error_colour(float(error) / length)
-               for error in np.linalg.norm(simulated - measured, axis=1)]
+               for error in np.linalg.norm(simulated - points, axis=1)]
     yield brush.spheres('error', 2 * goal, simulated, colours, 1.7)
-    pairs = np.stack([measured, simulated], axis=1).reshape(-1, 3)
+    pairs = np.stack([points, simulated], axis=1).reshape(-1, 3)
     yield brush.marker('error', 2 * goal + 1, LINE_LIST, points=pairs, scale=0.4, group=2,
                        colours=[colour for colour in colours for _ in range(2)])
 
 
 def _hand_markers(brush: _Brush, first: int, hand: Hand, colour: Colour, trial: Trial) -> Iterator[Any]:
     """Show a hand's path, the points that it grips as it closes, and where it opens."""
-    path = hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, PATH_SAMPLES)))
+    path = hand_path(hand)
     if np.ptp(path, axis=0).max() > 0:
         yield brush.line('hands', first, path, colour, 0.5)
     yield brush.spheres('hands', first + 1, trial.initial.points[list(hand.grips)], [colour], 2.2)

@@ -13,9 +13,10 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
-from dlo_calibration.report.page import Origin, repeating_command, write_evaluations
+from dlo_calibration.report.page import Origin, repeating_command
 from dlo_calibration.ros.report_writer import ReportWriter
 
 

@@ -7,7 +7,6 @@ import csv
 import hashlib
 import html
 import json
-import math
 import os
 from pathlib import Path
 import re
@@ -25,7 +24,6 @@ from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
-from dlo_calibration.cli.output import _finite
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
@@ -328,10 +326,6 @@ def test_module_is_the_command(session):
     assert done.returncode == 0
     assert done.stderr == ''
     assert len(only_json(done.stdout)['trials']) == 2
-
-
-def test_infinity_is_null_in_json():
-    assert _finite({'a': [math.inf, 1.0], 'b': float('nan')}) == {'a': [None, 1.0], 'b': None}
 
 
 def test_output_folder_may_be_that_of_the_session(run, session, tmp_path):

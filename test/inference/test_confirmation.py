@@ -13,6 +13,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import calibrate, SimulationError
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result, write_result
@@ -21,7 +22,7 @@ from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, trial_score
 from dlo_calibration.report.page import Origin, write_report
-from dlo_calibration.report.terminal import error_facts
+from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.simulation.protocol import Rollout
@@ -205,9 +206,9 @@ def test_fit_and_validate_tell_both_engines(command, tmp_path):
 
 def test_people_are_told(tmp_path):
     before, after = found(SecondToy(0.004))
-    assert dict(error_facts(after))['confirmed by second toy'].endswith(
-        'points 4.00 mm from those of toy, 4.00 mm at most')
-    assert 'confirmed by second toy' not in dict(error_facts(before))
+    assert dict(fit_facts(plain(after)))['confirmed by second toy'].endswith(
+        'points 4 mm from those of toy, 4 mm at most')
+    assert 'confirmed by second toy' not in dict(fit_facts(plain(before)))
     write_report(tmp_path / 'report.html', after, Origin('session', 'fit', Options()))
     assert 'confirmed by second toy' in (tmp_path / 'report.html').read_text(encoding='utf-8')
 

@@ -10,11 +10,12 @@ import pytest
 from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
 
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import with_missing_parameters
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.report.sentences import sentences, values
+from dlo_calibration.report.sentences import sentences
 from dlo_calibration.search import LeastSquares
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -31,7 +32,7 @@ def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     assert result.missing_parameters[0].name == name
     assert result.missing_parameters[0].share > 0.15
     assert f'add {name}' in sentences(result)[-1]
-    assert values(result)['explanations'][name] == result.missing_parameters[0].share
+    assert plain(result)['explanations'][name] == result.missing_parameters[0].share
 
 
 def test_it_names_parts_of_different_stiffness():
@@ -44,7 +45,7 @@ def test_it_names_parts_of_different_stiffness():
 def test_where_only_noise_is_left_there_is_nothing_to_explain():
     result = found(observed(EVEN, TRUTH))
     assert result.missing_parameters == ()
-    assert values(result)['explanations'] == {}
+    assert plain(result)['explanations'] == {}
 
 
 def test_nothing_is_named_that_would_not_help():

@@ -7,14 +7,15 @@ from dataclasses import replace
 import io
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageColor
 import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.animation import densely, MOST_FRAMES, simulated_motion, write_animation
-from dlo_calibration.report.drawing import horizontal_direction, session_picture, trial_picture
+from dlo_calibration.report.drawing import session_picture, View
+from dlo_calibration.report.figure import blank_figure, SIMULATED
 from dlo_calibration.simulation.protocol import Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling
 
@@ -34,7 +35,7 @@ def tracked(count):
 def trial_png(trial, chains):
     """Return the picture as the bytes of a PNG."""
     buffer = io.BytesIO()
-    trial_picture(trial, chains, buffer)
+    session_picture([trial], None if chains is None else [chains], buffer)
     return buffer.getvalue()
 
 
@@ -42,20 +43,20 @@ def pixels(trial, chains):
     return np.asarray(Image.open(io.BytesIO(trial_png(trial, chains))).convert('RGB')).astype(int)
 
 
-def orange(image):
+def simulated(image):
     """Count pixels of the colour of what is simulated."""
-    return int((np.abs(image - (255, 127, 14)).sum(axis=2) < 30).sum())
+    return int((np.abs(image - ImageColor.getrgb(SIMULATED)).sum(axis=2) < 30).sum())
 
 
 def test_simulated_chain_is_drawn_where_there_is_one():
     trial, = toy_trials(1)
-    assert orange(pixels(trial, None)) == 0
-    assert orange(pixels(trial, chains_of(trial, 0.05))) > 500
+    assert simulated(pixels(trial, None)) == 0
+    assert simulated(pixels(trial, chains_of(trial, 0.05))) > 500
 
 
 def test_picture_of_a_session_has_a_row_per_trial(tmp_path):
     trials = toy_trials(3)
-    trial_picture(trials[0], chains_of(trials[0]), tmp_path / 'one.png')
+    session_picture(trials[:1], [chains_of(trials[0])], tmp_path / 'one.png')
     session_picture(trials, [chains_of(trial) for trial in trials], tmp_path / 'all.png')
     one, all_three = Image.open(tmp_path / 'one.png'), Image.open(tmp_path / 'all.png')
     assert one.width == all_three.width
@@ -86,14 +87,16 @@ def test_picture_of_unusual_trials(trial):
 def test_file_that_cannot_be_written_is_an_input_error(tmp_path):
     trial, = toy_trials(1)
     with pytest.raises(InputError, match='--output'):
-        trial_picture(trial, None, tmp_path / 'none' / 'one.png')
+        session_picture([trial], None, tmp_path / 'none' / 'one.png')
 
 
-def test_side_view_looks_along_the_trial():
-    direction = horizontal_direction(toy_trials(1)[0])
-    assert direction[2] == 0
-    assert np.linalg.norm(direction) == pytest.approx(1)
-    assert abs(direction[0]) > 0.9
+def test_side_view_looks_across_the_trial():
+    trial, = toy_trials(1)
+    axes = blank_figure(4, 4).subplots()
+    across, up = View(axes, trial, above=False).flat(np.eye(3))
+    assert up.tolist() == [0, 0, 1]
+    assert np.linalg.norm(across) == pytest.approx(1)
+    assert abs(across[0]) > 0.9
 
 
 @pytest.mark.parametrize('count', [1, 2, 5, 6, 500])

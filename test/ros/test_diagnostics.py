@@ -87,7 +87,7 @@ def test_progress_tells_the_best_so_far_and_what_is_left(types):
     assert values == {'evaluation': '5', 'evaluations': '150', 'score': 'inf', 'best_score': '12.0',
                       'best_friction': '25.0', 'simulations_per_second': '31.5', 'seconds_left': '4.6',
                       'failure': 'diverged'}
-    assert one.message == 'evaluation 5 of 150, best score 12.0, 5 s left'
+    assert one.message == 'evaluation 5 of 150, best score 12, 4.6 s left'
     assert one.level == types.level(1)
 
 

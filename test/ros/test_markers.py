@@ -15,6 +15,7 @@ from wire import wire
 
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.trial import Goal, INSTANTS
 from dlo_calibration.ros.markers import error_colour, markers, MOST_POINTS
 from dlo_calibration.search import RandomSearch
@@ -84,7 +85,7 @@ def test_result_shows_the_simulated_chain_and_the_error_of_each_point(types, res
         ends = points(lines).reshape(-1, 2, 3)
         assert np.allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), errors)
         label, = found[f'trial_{k}/label']
-        assert f'max {errors.max() * 1e3:.1f} mm' in label.text
+        assert f'max {measured(errors.max(), "m")}' in label.text
 
 
 def test_trial_that_came_after_the_result_is_shown_as_measured(types, result):

@@ -6,13 +6,14 @@
 import json
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageColor
 import pytest
 from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 
 from dlo_calibration.cli import main as cli
 from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.report.figure import SIMULATED
 
 
 @pytest.fixture
@@ -60,10 +61,10 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
     one, two = (np.asarray(Image.open(tmp_path / name / 'trial_1.png').convert('RGB')).astype(int)
                 for name in ('measured', 'both'))
 
-    def orange(image):
-        return (np.abs(image - (255, 127, 14)).sum(axis=2) < 30).sum()
+    def simulated(image):
+        return (np.abs(image - ImageColor.getrgb(SIMULATED)).sum(axis=2) < 30).sum()
 
-    assert orange(one) == 0 < orange(two)
+    assert simulated(one) == 0 < simulated(two)
 
 
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):

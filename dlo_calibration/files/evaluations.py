@@ -1,0 +1,27 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Evaluations: everything that a calibration tried, as a CSV file."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from dlo_calibration.calibration.plain import evaluation_rows
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import unwritable
+
+
+def write_evaluations(path: Path, result: CalibrationResult) -> None:
+    """
+    Write every evaluation as a row of a CSV file; see `evaluation_rows`.
+
+    :raises InputError: where the file cannot be written.
+    """
+    head, rows = evaluation_rows(result)
+    try:
+        with path.open('w', newline='', encoding='utf-8') as stream:
+            csv.writer(stream).writerows([head, *rows])
+    except OSError as error:
+        raise unwritable(path, error) from error

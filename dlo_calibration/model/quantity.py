@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Quantity: a number and its unit as text, for people, and for programs that read it back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Sequence
+
+import numpy as np
+
+
+def exact(value: Any) -> str:
+    """Return a value as text from which a program reads it back exactly."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, (tuple, list)):
+        return ' '.join(exact(one) for one in value)
+    return str(value) if isinstance(value, (int, str)) else repr(float(value))
+
+
+def number(value: float | None) -> str:
+    """
+    Return a number with three significant digits, for people; a dash where it is not known.
+
+    It has a power of ten only where it is very large or very small.
+    """
+    if value is None or not math.isfinite(value):
+        return '-'
+    if value == 0 or 1e-6 <= abs(value) < 1e6:
+        return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
+    return f'{value:.2e}'
+
+
+def measured(value: float | None, unit: str) -> str:
+    """Return a physical value (SI) with its unit, for people: a length in mm, a coefficient without unit."""
+    return _joined([value], unit)
+
+
+def interval(lower: float | None, upper: float | None, unit: str) -> str:
+    """Return both ends of an interval (SI) with their unit, as `measured` writes one value."""
+    return _joined([lower, upper], unit)
+
+
+def _joined(values: Sequence[float | None], unit: str) -> str:
+    if unit == 'm':
+        values, unit = [None if value is None else 1e3 * value for value in values], 'mm'
+    text = ' to '.join(map(number, values))
+    return text if unit == '1' else f'{text} {unit}'

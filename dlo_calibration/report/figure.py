@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Figure: what all drawings share: colours, settings, legends, the file of a PNG, the panels of the page."""
+
+from __future__ import annotations
+
+import base64
+from contextlib import contextmanager
+from dataclasses import dataclass
+import io
+from pathlib import Path
+import textwrap
+import threading
+from typing import Any, Callable, Iterator, Sequence, TYPE_CHECKING
+
+from dlo_calibration.errors import unwritable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+
+#: The palette of Okabe and Ito, which colour-blind people tell apart (Color Universal Design, 2008).
+BLUE, GREEN, PURPLE, SKY, YELLOW = '#0072b2', '#009e73', '#cc79a7', '#56b4e9', '#e69f00'
+OBSERVED, SIMULATED, BEFORE, FAINT = 'black', '#d55e00', '0.72', '0.45'
+DOTS_PER_INCH = 110  # of a PNG
+WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page, which is read on a phone, too
+MARGINS = 0.82, 0.12, 0.3, 0.55  # in, left, right, above and below the axes of a panel
+LABEL_WIDTH = 64  # characters that fit into a panel's legend
+LEGEND_LINE, BAR_ROOM = 0.19, 0.95  # in, of a line of that legend, and beside the axes for a bar of colours
+#: Matplotlib's settings are the process's own, and its fonts are not made for threads.
+_LOCK = threading.Lock()
+SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'path', 'axes.spines.top': False,
+            'axes.spines.right': False, 'axes.titley': 1.0, 'axes.axisbelow': True}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """
+    A drawing of the page.
+
+    :param source: an SVG image in a data URI.
+    :param words: what it shows, for those who cannot see it.
+    """
+
+    source: str
+    words: str
+
+
+def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Panel:
+    """Draw on axes of their own for the page, with the legend below them."""
+    left, right, top, bottom = MARGINS
+    with settings():
+        figure = blank_figure(WIDTH, HEIGHT, layout=None)
+        axes = figure.add_axes((0, 0, 1, 1))
+        draw(axes)
+        handles, labels = axes.get_legend_handles_labels()
+        labels = [textwrap.fill(label, LABEL_WIDTH) for label in labels]
+        lines = sum(1 + label.count('\n') for label in labels) if legend else 0
+        height = HEIGHT + LEGEND_LINE * lines
+        figure.set_size_inches(WIDTH, height)
+        bars = figure.axes[1:]
+        for one, x, width in ((axes, left, WIDTH - left - right - BAR_ROOM * len(bars)),
+                              *((bar, WIDTH - BAR_ROOM + 0.1, 0.15) for bar in bars)):
+            one.set_position((x / WIDTH, (height - HEIGHT + bottom) / height, width / WIDTH,
+                              (HEIGHT - top - bottom) / height))
+        if lines:
+            figure.legend(handles, labels, loc='lower left', bbox_to_anchor=(0.02, 0), frameon=False,
+                          fontsize=9, labelspacing=0.35)
+        octets = io.BytesIO()
+        figure.savefig(octets, format='svg', metadata={'Date': None})
+    return Panel(f'data:image/svg+xml;base64,{base64.b64encode(octets.getvalue()).decode()}', words)
+
+
+@contextmanager
+def settings() -> Iterator[None]:
+    """Draw with the settings of all drawings, one drawing at a time."""
+    from matplotlib import rc_context
+
+    with _LOCK, rc_context(SETTINGS):
+        yield
+
+
+def blank_figure(width: float, height: float, layout: Any = 'constrained') -> Figure:
+    """Return an empty figure [in] that never opens a window or is kept alive: there is no pyplot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def write_figure(figure: Figure, path: str | Path) -> None:
+    """
+    Write a figure as a PNG.
+
+    :raises InputError: where the file cannot be written.
+    """
+    try:
+        figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:
+    """Explain below the figure what is drawn in `axes`, everything once."""
+    shown: dict[str, Any] = {}
+    for one in axes:
+        for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, handle)
+    figure.legend(list(shown.values()), list(shown), loc='outside lower center', frameon=False,
+                  ncols=min(columns, len(shown)))
+
+
+def as_text(name: str) -> str:
+    """Return a name so that it is written as it is: neither a formula nor a hidden label."""
+    shown = name.replace('$', r'\$')
+    return f' {shown}' if shown.startswith('_') else shown
