@@ -28,7 +28,9 @@ def number(value: float | None) -> str:
     """
     if value is None or not math.isfinite(value):
         return '-'
-    if value == 0 or 1e-6 <= abs(value) < 1e6:
+    if value == 0:
+        return '0'  # -0.0, too
+    if 1e-6 <= abs(value) < 1e6:
         return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
     return f'{value:.2e}'
 

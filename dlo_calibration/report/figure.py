@@ -27,7 +27,7 @@ DOTS_PER_INCH = 110  # of a PNG
 WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page, which is read on a phone, too
 MARGINS = 0.82, 0.12, 0.3, 0.55  # in, left, right, above and below the axes of a panel
 LABEL_WIDTH = 64  # characters that fit into a panel's legend
-LEGEND_LINE, BAR_ROOM = 0.19, 0.95  # in, of a line of that legend, and beside the axes for a bar of colours
+LEGEND_LINE, BAR_ROOM = 0.17, 0.8  # in, of a line of that legend, and beside the axes for a bar of colours
 #: Matplotlib's settings are the process's own, and its fonts are not made for threads.
 _LOCK = threading.Lock()
 SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'path', 'axes.spines.top': False,

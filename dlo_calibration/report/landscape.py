@@ -93,14 +93,14 @@ def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values
         cells = axes.pcolormesh(*plane.values, np.ma.masked_invalid(np.maximum(values, low)).T, cmap='Blues',
                                 norm=LogNorm(low, high), shading='nearest')
         steps = np.geomspace(low, high, 5)
-        bar = axes.figure.colorbar(cells, ax=axes, label=f'{what} [{unit}]', ticks=steps)
+        bar = axes.figure.colorbar(cells, ax=axes, ticks=steps)
         bar.ax.minorticks_off()
         bar.ax.set_yticklabels([number(step) for step in steps])
         region = _region(result, plane)
         if region is not None:
             axes.plot(*region, '--', color=SIMULATED, label='both are in there with 90 % probability')
         _mark(axes, *(result.parameters[name].value for name in plane.names))
-        axes.set(title=what, xlabel=f'{one} [0 to 100]', ylabel=f'{two} [0 to 100]',
+        axes.set(title=f'{what} [{unit}]', xlabel=f'{one} [0 to 100]', ylabel=f'{two} [0 to 100]',
                  xlim=plane.values[0, [0, -1]], ylim=plane.values[1, [0, -1]])
 
     return panel(draw, f'{what} over {one} and {two}: from {number(low)} {unit} to {number(high)} {unit}')

@@ -56,7 +56,7 @@ def test_a_parameter_that_some_runs_told_says_so():
 def test_validity_has_score_and_error_and_marks_the_very_similar():
     text = markdown(ACCOUNT)
     _, row, actions = cells(text, 'rope')
-    assert row == ['rope', 'random', '**40**', '17.3', '2 of 3 runs', '80', '40 mm', '17.3 mm', '4', '2',
+    assert row == ['rope', 'random', '**40**', '17.3', '2 of 3 runs', '80', '40 mm', '17.3 mm', '4', '2 mm',
                    '102', '1']
     assert actions == ['rope', 'random', '23.3 ± 15.3', '56.7 ± 20.8']
     worse = replace(FINDINGS, score=replace(FINDINGS.score, mean=50.0))
