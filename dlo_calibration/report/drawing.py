@@ -48,7 +48,6 @@ HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99
 INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # early to late
 PATH_SAMPLES = 60  # of a hand's path
 LINE_HEIGHT = 0.25  # in, of a legend
-LABEL_SIZE = (0.08, 0.06)  # from a label's point to its middle, relative to the size of what is drawn
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def trial_panels(drawn: Drawn) -> list[Panel]:
               f'{name}, error of each point: the mean is {measured(errors.mean, "m")}, '
               f'the largest {measured(errors.max, "m")}'),
         panel(lambda axes: _draw_differences(axes, drawn),
-              f'{name}, simulated minus measured coordinates: {", ".join(by_axis)}')]
+              f'{name}, residuals by coordinate: {", ".join(by_axis)}')]
 
 
 def hand_colours(trials: Sequence[Trial]) -> Mapping[str, str]:
@@ -228,20 +227,9 @@ class View:
                        label=None if colour else 'one point, measured and simulated')
 
     def draw_first_point(self) -> None:
-        """Name the point at which the DLO begins."""
-        chains = [self.trial.initial, *(goal.chain for goal in self.trial.goals)]
-        shown = np.concatenate([self.flat(chain.points).T for chain in chains])
-        first = shown[0]
-
-        def room(side: tuple[int, int]) -> float:
-            middle = first + LABEL_SIZE * np.array(side) * np.ptp(shown, axis=0).max()
-            return float(np.linalg.norm(shown - middle, axis=1).min())
-
-        right, up = max(((1, 1), (1, -1), (-1, 1), (-1, -1)), key=room)
-        self.axes.annotate(
-            'first point', (first[0], first[1]), textcoords='offset points', xytext=(0, 9 * up),
-            fontsize='small', color='0.3', ha='left' if right > 0 else 'right',
-            va='bottom' if up > 0 else 'top', zorder=1)
+        """Mark the point at which the DLO begins."""
+        self.axes.plot(*self.flat(self.trial.initial.points[:1]), 'o', markersize=11, markerfacecolor='none',
+                       markeredgecolor=OBSERVED, linestyle='none', zorder=6, label='first point of the DLO')
 
     def draw_hands(self, colours: Mapping[str, str]) -> None:
         """Draw where hands close, move and open."""
@@ -288,7 +276,7 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
         for k, grip in enumerate(hand.grips):
             axes.axvline(places[grip], color=drawn.colours[hand.name], linestyle='--', linewidth=1,
                          label=None if k else as_text(f'point that {hand.name} grips'))
-    axes.set(xlabel='place along the DLO, from its first point [m]',
+    axes.set(xlabel='arc length from the first point [m]',
              ylabel='distance [mm]' if chains is None else 'distance from measured to simulated [mm]',
              title='how far each point moved' if chains is None else 'error of each point')
     axes.set_ylim(bottom=0)
@@ -309,8 +297,8 @@ def _draw_differences(axes: Axes, drawn: Drawn) -> None:
             ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
         axes.plot(places, values * 1e3, color=colour, linestyle=dashes, linewidth=1.8, label=f'in {axis}')
     last = '' if len(trial.goals) == 1 else f', after {number(goal.time)} s'
-    axes.set(xlabel='place along the DLO, from its first point [m]', ylabel='difference [mm]',
-             title=f'simulated minus measured{last}')
+    axes.set(xlabel='arc length from the first point [m]', ylabel='difference [mm]',
+             title=f'residuals: simulated minus measured{last}')
     axes.grid(alpha=0.3)
 
 

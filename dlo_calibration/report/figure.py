@@ -57,7 +57,7 @@ def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Pane
         handles, labels = axes.get_legend_handles_labels()
         labels = [textwrap.fill(label, LABEL_WIDTH) for label in labels]
         lines = sum(1 + label.count('\n') for label in labels) if legend else 0
-        height = HEIGHT + LEGEND_LINE * lines
+        height = HEIGHT + LEGEND_LINE * (lines + 0.5 * (lines > 0))
         figure.set_size_inches(WIDTH, height)
         bars = figure.axes[1:]
         for one, x, width in ((axes, left, WIDTH - left - right - BAR_ROOM * len(bars)),

@@ -58,8 +58,8 @@ def _open(result: CalibrationResult) -> list[str]:
 
 
 def _silent(result: CalibrationResult) -> list[str]:
-    names = silent(result.trials, result.examination) if len(result.trials) > 1 else ()
-    return [f'{", ".join(names)} told nothing: all of it would have been known without.'] if names else []
+    names = silent(result) if len(result.trials) > 1 else ()
+    return [f'{", ".join(names)} told nothing: the parameters would be known as well without.'] * bool(names)
 
 
 def _advice(result: CalibrationResult) -> list[str]:
@@ -99,5 +99,5 @@ def _unexplained(result: CalibrationResult) -> list[str]:
     names = [one.name for one in result.missing_parameters if one.name != PARTS]
     how = [f'add {" or ".join(names)} to calibrate'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
-    return [f'Of the squares of what is left over, these would explain about: {", ".join(shares)}. '
-            f'To calibrate them, too, {"; or ".join(how)}.']
+    return [f'Parameters that were held fixed would explain about this much of the squared residuals: '
+            f'{", ".join(shares)}. To calibrate them, too, {"; or ".join(how)}.']
