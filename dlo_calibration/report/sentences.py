@@ -58,7 +58,7 @@ def _open(result: CalibrationResult) -> list[str]:
 
 
 def _silent(result: CalibrationResult) -> list[str]:
-    names = silent(result) if len(result.trials) > 1 else ()
+    names = silent(result.trials, result.examination) if len(result.trials) > 1 else ()
     return [f'{", ".join(names)} told nothing: the parameters would be known as well without.'] * bool(names)
 
 
