@@ -78,6 +78,7 @@ setup(
             'mypy>=1.14',
             'pytest>=7.4',
             'pytest-benchmark>=4.0',
+            'pytest-xdist>=3.5',
             'ruff>=0.6',
             'setuptools>=70.1,<80',  # builds wheels by itself; colcon knows none newer
         ],

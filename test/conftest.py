@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+import fcntl
 from importlib.util import find_spec
 import itertools
 import json
@@ -25,12 +26,15 @@ ROOT = Path(__file__).resolve().parents[1]
 NAME = 'dlo_calibration'
 FOLDERS = (NAME, 'config', 'launch', 'msg_samples', 'resource')  # of what is installed
 
-# Above 101 the ports of a domain fall into the range that Linux gives to any program.
+# Each worker of pytest-xdist takes its own share of the DDS domains.  Above 101 the ports of a domain fall
+# into the range that Linux gives to any program.
 # https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Domain-ID.html
-DOMAINS = 101
+WORKER = os.environ.get('PYTEST_XDIST_WORKER', '')  # gw0, gw1, ...; none without pytest-xdist
+DOMAINS = range(1 + int(WORKER.removeprefix('gw') or 0), 102,
+                int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', 1)))
 FIRST_PORT, PORTS_PER_DOMAIN, UNICAST = 7400, 250, 10
 
-_turns = itertools.count(os.getpid())
+_turns = itertools.count(os.getpid())  # tests of two checkouts at the same time begin in different domains
 
 
 def _unused(domain: int) -> bool:
@@ -50,7 +54,7 @@ def ros_graph(folder) -> Iterator[Mapping[str, str]]:
 
     It holds for this process, and for a child that gets the returned environment.
     """
-    domains = (1 + turn % DOMAINS for turn in itertools.islice(_turns, DOMAINS))
+    domains = (DOMAINS[turn % len(DOMAINS)] for turn in itertools.islice(_turns, len(DOMAINS)))
     domain = next(filter(_unused, domains))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
@@ -96,16 +100,20 @@ def sources(tmp_path_factory):
 
 
 @pytest.fixture(scope='session')
-def install(sources):
-    """Build with colcon and return the folder `install` of the workspace."""
+def install(sources, tmp_path_factory):
+    """Build with colcon, once for all workers, and return the folder `install` of the workspace."""
     if find_spec('colcon_core') is None or find_spec('colcon_ros') is None:
         pytest.skip('colcon is not installed; the extra "test" of setup.py has it')
-    workspace = sources.parent
-    done = subprocess.run(
-        [sys.executable, '-W', 'ignore', '-m', 'colcon', '--log-base', 'log', 'build'],
-        cwd=workspace, capture_output=True, text=True)
-    assert done.returncode == 0, f'{done.stdout}{done.stderr}'
-    return workspace / 'install'
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if WORKER else base) / 'install'
+    with folder.with_suffix('.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            done = subprocess.run(
+                [sys.executable, '-W', 'ignore', '-m', 'colcon', '--log-base', 'log', 'build',
+                 '--install-base', folder], cwd=sources.parent, capture_output=True, text=True)
+            assert done.returncode == 0, f'{done.stdout}{done.stderr}'
+    return folder
 
 
 @pytest.fixture(scope='session')

@@ -8,13 +8,9 @@ import signal
 import subprocess
 import sys
 
-import pytest
+from graph import child, ended
 
 from dlo_calibration.files.session import read_session
-
-pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
-
-from test_node import child, ended  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 PATIENCE = 60.0  # s

@@ -4,31 +4,17 @@
 """The summary of an experiment: its numbers are those of known outcomes."""
 
 import numpy as np
+from outcomes import outcomes, ROPE
 import pytest
-from toy_messages import toy_trials
 
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.experiment.outcome import Judgement, Outcome
-from dlo_calibration.experiment.study import Observed, Subject, Task
+from dlo_calibration.experiment.outcome import Outcome
+from dlo_calibration.experiment.study import Subject, Task
 from dlo_calibration.experiment.summary import Spread, summary
-
-OPTIONS = Options.of({'calibrate': ['friction', 'elasticity']})
-ROPE = Subject('rope', Observed(tuple(toy_trials(2)), OPTIONS), (0, 1))
-
-
-def run(seed, friction, scores, told=('friction',), seconds=1.0):
-    """Return the three calibrations of a run: on all trials, and without each of the two."""
-    values = {'friction': friction, 'elasticity': 25.0}
-    whole = Outcome(values, told, 5.0, 0.002, 100 + seed, 300, seconds)
-    rest = [Outcome(values, told, 5.0, 0.002, 100, 300, seconds, (Judgement(
-        f'trial {k + 1}', score, None if score is None else score / 1000,
-        None if score is None else score / 10),)) for k, score in enumerate(scores)]
-    return [(Task(ROPE, 'random', seed, 'toy', left_out), outcome)
-            for left_out, outcome in zip((None, 0, 1), (whole, *rest), strict=True)]
 
 
 def test_the_numbers_are_those_of_the_runs():
-    found = summary([*run(1, 60.0, (10.0, 50.0)), *run(2, 70.0, (40.0, 80.0)), *run(3, 80.0, (20.0, 40.0))])
+    found = summary([*outcomes(1, 60.0, (10.0, 50.0)),
+                     *outcomes(2, 70.0, (40.0, 80.0)), *outcomes(3, 80.0, (20.0, 40.0))])
     assert (found.subject, found.search, found.runs, found.failures) == ('rope', 'random', 3, 0)
     assert found.parameters['friction'] == Spread(70.0, 10.0, 3)
     assert found.parameters['elasticity'] == Spread(25.0, 0.0, 3)
@@ -46,20 +32,21 @@ def test_the_numbers_are_those_of_the_runs():
 
 
 def test_a_parameter_may_be_told_in_some_runs_only():
-    found = summary([*run(1, 60.0, (1.0, 1.0), ('friction', 'elasticity')), *run(2, 70.0, (1.0, 1.0))])
+    found = summary([*outcomes(1, 60.0, (1.0, 1.0), ('friction', 'elasticity')),
+                     *outcomes(2, 70.0, (1.0, 1.0))])
     assert found.informed == {'friction': 2, 'elasticity': 1}
 
 
 def test_an_unfinished_run_does_not_count():
-    found = summary([*run(1, 60.0, (10.0, 50.0)), *run(2, 90.0, (40.0, 80.0))[:2]])
+    found = summary([*outcomes(1, 60.0, (10.0, 50.0)), *outcomes(2, 90.0, (40.0, 80.0))[:2]])
     assert found.runs == 1
     assert found.parameters['friction'] == Spread(60.0, None, 1)
 
 
 def test_failures_are_counted_and_left_out_of_the_means():
-    second = run(2, 70.0, (None, 30.0))
+    second = outcomes(2, 70.0, (None, 30.0))
     second[0] = (second[0][0], Outcome({}, failure='diverged'))
-    found = summary([*run(1, 60.0, (10.0, 50.0)), *second])
+    found = summary([*outcomes(1, 60.0, (10.0, 50.0)), *second])
     assert found.failures == 2
     assert found.parameters['friction'] == Spread(60.0, None, 1)
     assert found.score == Spread(30.0, 0.0, 2)

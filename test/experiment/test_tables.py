@@ -8,9 +8,9 @@ from dataclasses import replace
 from io import StringIO
 
 import numpy as np
+from outcomes import outcomes
 from PIL import Image
 import pytest
-from test_summary import run
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment.summary import summary
@@ -24,7 +24,7 @@ from dlo_calibration.experiment.tables import (
     validity_csv,
 )
 
-DONE = [*run(1, 60.0, (10.0, 50.0)), *run(2, 70.0, (40.0, 80.0)), *run(3, 80.0, (20.0, 40.0))]
+DONE = [*outcomes(1, 60.0, (10.0, 50.0)), *outcomes(2, 70.0, (40.0, 80.0)), *outcomes(3, 80.0, (20.0, 40.0))]
 FINDINGS = summary(DONE)
 ACCOUNT = Account((FINDINGS,), 'the command', 'toy', 3, 150, samples=False, complete=True)
 

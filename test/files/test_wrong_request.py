@@ -153,7 +153,7 @@ def test_node_survives_mutated_bytes_and_calibrates_good_trials(ros_environment,
 
 def whole_result(robot):
     """Return what the result says of the calibration as a whole."""
-    from test_node import whole
+    from graph import whole
 
     return whole(robot.until_result())
 
@@ -307,12 +307,12 @@ def test_killed_at_any_moment_a_session_reads_up_to_its_last_complete_message(tm
 
 @pytest.mark.parametrize('turn', range(3))
 def test_node_killed_while_it_records_loses_nothing_that_it_told(ros_environment, tmp_path, turn, command):
-    import test_node
+    import graph
 
     moment = 1 + turn * 7
-    pairs = session_messages(test_node.TYPES, 8)
-    with test_node.child(ros_environment, tmp_path / 'out') as process, \
-            test_node.robot_of(ros_environment) as robot:
+    pairs = session_messages(graph.TYPES, 8)
+    with graph.child(ros_environment, tmp_path / 'out') as process, \
+            graph.robot_of(ros_environment) as robot:
         robot.matched()
         for k, pair in enumerate(pairs):
             robot.send([pair])
@@ -322,10 +322,10 @@ def test_node_killed_while_it_records_loses_nothing_that_it_told(ros_environment
         robot.until(lambda: robot.status['incomplete'] or robot.status['trials'] != '0')
         process.kill()
         process.wait()
-        told = [test_node.values(message.status[0]) for message in robot.heard['status']]
+        told = [graph.values(message.status[0]) for message in robot.heard['status']]
     folder, = (tmp_path / 'out').glob('dlo_session_*')
     session = read_session(folder)
-    recorded = [test_node.values(message.status[0]) for message in session.outputs('status')]
+    recorded = [graph.values(message.status[0]) for message in session.outputs('status')]
     assert told and all(one in recorded for one in told)
     trials, _ = session_trials(session, Options())
     assert len(trials) >= int(told[-1]['trials'])

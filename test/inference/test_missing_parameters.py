@@ -5,9 +5,9 @@
 
 from dataclasses import replace
 
+from carried import EVEN, observed, STIFF_MIDDLE, TRUTH
 from fitting import fitted
 import pytest
-from test_parts import EVEN, observed, STIFF_MIDDLE, TRUTH
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.plain import plain

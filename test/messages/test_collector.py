@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from trial_contents import contents
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
@@ -70,17 +71,6 @@ def refused(collector, message):
     text = str(caught.value)
     assert text.startswith(f'{message}: got ')
     return text
-
-
-def contents(trials):
-    """Return all that trials hold, comparable."""
-    def octets(array):
-        return None if array is None else (array.shape, array.tobytes())
-
-    return [(t.name, octets(t.initial.points), octets(t.initial.hands), octets(t.velocity),
-             [[(h.name, h.grips, octets(h.times), octets(h.positions), octets(h.orientations))
-               for h in a.hands] for a in t.actions],
-             [(octets(g.chain.points), g.time, g.stable, g.held_by) for g in t.goals]) for t in trials]
 
 
 # ---- what makes a trial

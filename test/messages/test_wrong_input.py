@@ -12,9 +12,9 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from live import live_node, LOG_WARN, QUICK
 import pytest
-from test_collector import contents
 from toy_messages import SECOND, session_messages, write_session
 from toy_simulator import new_toy
+from trial_contents import contents
 from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRONG
 
 from dlo_calibration import calibrate, InputError
@@ -35,10 +35,10 @@ GOOD = session_messages(FILES, 2)
 class Topics:
     """The topics and services of a live node with two good trials; one for the whole module."""
 
-    def __init__(self, robot, node_module):
+    def __init__(self, robot, graph):
         self.robot = robot
-        self.module = node_module
-        self.types = node_module.TYPES
+        self.graph = graph
+        self.types = graph.TYPES
         self.robot.send(session_messages(self.types, 2))
         self.robot.until_status(trials='2')
         self.score = self.calibrated()
@@ -51,7 +51,7 @@ class Topics:
         assert answer.success, answer.message
         self.robot.until(lambda: len(results) > count, 'no result')
         self.robot.until_status(state='done')
-        return self.module.whole(results[-1])['score']
+        return self.graph.whole(results[-1])['score']
 
     @contextmanager
     def refusing(self):
@@ -63,7 +63,7 @@ class Topics:
 
         def texts():
             statuses = self.robot.heard['status'][mark[0]:]
-            said = (self.module.values(message.status[0])['last_refusal'] for message in statuses)
+            said = (self.graph.values(message.status[0])['last_refusal'] for message in statuses)
             return [text for text, _ in itertools.groupby(said)]
 
         def warnings():
@@ -81,10 +81,10 @@ class Topics:
 
 @pytest.fixture(scope='module')
 def topics(shared_ros_environment, tmp_path_factory):
-    import test_node
+    import graph
 
     with live_node(shared_ros_environment, tmp_path_factory.mktemp('node')) as robot:
-        yield Topics(robot, test_node)
+        yield Topics(robot, graph)
 
 
 @functools.cache

@@ -3,7 +3,6 @@
 
 """The node over a real graph: what robot software sees."""
 
-from contextlib import contextmanager
 import functools
 import json
 import logging
@@ -14,9 +13,12 @@ import subprocess
 import sys
 import time
 
+from graph import child, ended, LATCHED, PATIENCE, robot_of, TYPES, values, whole
+from live import LOG_WARN
 from processes import children
 import pytest
-import toy_calibrator
+from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
@@ -25,108 +27,9 @@ from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, rclpy_types
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.ros.calibrator_node import CalibratorNode
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
-
-rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
-pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rcl_interfaces.msg import Log  # noqa: E402
-from rclpy.context import Context  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
-
-from dlo_calibration.ros.calibrator_node import CalibratorNode  # noqa: E402
-
-PATIENCE = 60.0  # s
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-CHILD = Path(toy_calibrator.__file__)
-TYPES = rclpy_types()
-LOG_WARN = 30  # rcl_interfaces/msg/Log
-
-
-class Robot:
-    """Robot software: publishes, calls and listens; spins the node too, where it is in this process."""
-
-    def __init__(self, context, reliability=ReliabilityPolicy.RELIABLE):
-        self.context = context
-        self.node = Node('robot', context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.calibrator = None
-        self.heard = {'progress': [], 'status': [], 'result': [], 'log': []}
-        for name in ('progress', 'status', 'result'):
-            self.listen(name, LATCHED if name != 'progress' else QoSProfile(depth=1000))
-        self.node.create_subscription(Log, '/rosout', self.heard['log'].append, QoSProfile(depth=100))
-        qos = QoSProfile(depth=1000, reliability=reliability)
-        self.publishers = {kind: self.node.create_publisher(TYPES.find(name), f'/calibrator/{kind}', qos)
-                           for kind, name in INPUT_TYPES.items()}
-        self.clients = {name: self.node.create_client(Trigger, f'/calibrator/{name}')
-                        for name in ('start', 'stop', 'reset')}
-
-    def listen(self, name, qos):
-        self.node.create_subscription(DiagnosticArray, f'/calibrator/{name}', self.heard[name].append, qos)
-
-    def until(self, condition, why='it never happened'):
-        begun = time.monotonic()
-        while not condition():
-            assert time.monotonic() - begun < PATIENCE, f'{why}; status {self.status}'
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def matched(self):
-        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values())
-                   and all(c.service_is_ready() for c in self.clients.values()) and self.heard['status'])
-
-    def send(self, pairs):
-        self.matched()
-        for kind, message in pairs:
-            self.publishers[kind].publish(message)
-
-    def call(self, name):
-        future = self.clients[name].call_async(Trigger.Request())
-        self.until(future.done)
-        return future.result()
-
-    @property
-    def status(self):
-        return values(self.heard['status'][-1].status[0]) if self.heard['status'] else {}
-
-    def until_status(self, **expected):
-        self.until(lambda: expected.items() <= self.status.items(), str(expected))
-
-    def until_result(self, count=1):
-        results = self.heard['result']
-        self.until(lambda: len(results) >= count or self.status['state'] == 'failed', 'no result')
-        assert self.status['state'] != 'failed', self.status
-        self.until_status(state='done')
-        return self.heard['result'][-1]
-
-
-def values(status):
-    return {pair.key: pair.value for pair in status.values}
-
-
-def whole(result):
-    return values(next(one for one in result.status if one.name == 'calibration'))
-
-
-@contextmanager
-def robot_of(environment, **arguments):
-    context = Context()
-    rclpy.init(args=[], context=context, domain_id=int(environment['ROS_DOMAIN_ID']),
-               signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        robot = Robot(context, **arguments)
-        yield robot
-        robot.executor.shutdown()
-        robot.node.destroy_node()
-    finally:
-        context.try_shutdown()
 
 
 @pytest.fixture
@@ -339,28 +242,6 @@ def test_integer_may_be_set_where_a_number_is_meant(start_node):
 def test_unknown_parameter_is_refused_when_the_node_is_made(start_node):
     with pytest.raises(InputError, match='masss'):
         start_node(masss=1.0)
-
-
-@contextmanager
-def child(environment, folder, *arguments, seconds=0.0):
-    """Run the node with the toy in a process of its own."""
-    folder.mkdir(exist_ok=True)
-    process = subprocess.Popen(
-        [sys.executable, str(CHILD), str(seconds), '--ros-args', '-p', f'output_directory:={folder}',
-         *arguments],
-        env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def ended(process):
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert 'Traceback' not in errors, errors
-    return process.returncode
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -13,13 +13,13 @@ LOG_WARN = 30  # rcl_interfaces/msg/Log
 
 @contextmanager
 def live_node(environment, folder, toy=None, **parameters):
-    """Give the robot of `test_node` with a node in this process; skip where there is no ROS."""
-    import test_node
+    """Give the robot of `graph` with a node in this process; skip where there is no ROS."""
+    import graph
 
-    with test_node.robot_of(environment) as robot:
-        robot.calibrator = test_node.CalibratorNode(
+    with graph.robot_of(environment) as robot:
+        robot.calibrator = graph.CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
-                test_node.Parameter(name, value=value)
+                graph.Parameter(name, value=value)
                 for name, value in {**QUICK, 'output_directory': str(folder), **parameters}.items()])
         robot.executor.add_node(robot.calibrator)
         try:
@@ -31,6 +31,6 @@ def live_node(environment, folder, toy=None, **parameters):
 
 def robot_types():
     """Return the message classes of the graph."""
-    from test_node import TYPES
+    from graph import TYPES
 
     return TYPES
