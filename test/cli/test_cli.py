@@ -345,8 +345,8 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     Path('my scene.urdf').write_text(SCENE, encoding='utf-8')
     session = write_session(tmp_path / 'recorded', session_messages(TYPES, 1),
-                            {'scene': 'my scene.urdf', 'evaluations': 2, 'workers': 1, 'settle_limit': 0.5,
-                             'nodes': 12, 'time_step': 0.01})
+                            {'scene': 'my scene.urdf', 'calibrate': ['flexibility'], 'evaluations': 2,
+                             'workers': 1, 'settle_limit': 0.2, 'nodes': 8, 'time_step': 0.01})
     documents = []
     for source in (session, 'out/session.mcap'):
         assert cli.main(['fit', str(source), '--json', '--output', 'out']) == 0

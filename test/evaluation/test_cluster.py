@@ -25,7 +25,7 @@ distributed = pytest.importorskip('distributed', reason='the extra "distributed"
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0
-PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test'), os.environ.get('PYTHONPATH', '')])
+PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test/support'), os.environ.get('PYTHONPATH', '')])
 
 
 def dask(part, *words, **environment):

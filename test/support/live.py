@@ -7,19 +7,22 @@ from contextlib import contextmanager
 
 from toy_simulator import ToySimulator
 
-QUICK = {'evaluations': 4, 'workers': 1}
+QUICK = {'calibrate': ['flexibility', 'friction'], 'evaluations': 4, 'workers': 1}
 LOG_WARN = 30  # rcl_interfaces/msg/Log
 
 
 @contextmanager
 def live_node(environment, folder, toy=None, **parameters):
     """Give the robot of `graph` with a node in this process; skip where there is no ROS."""
-    import graph
+    from graph import robot_of
+    from rclpy.parameter import Parameter
 
-    with graph.robot_of(environment) as robot:
-        robot.calibrator = graph.CalibratorNode(
+    from dlo_calibration.ros.calibrator_node import CalibratorNode
+
+    with robot_of(environment) as robot:
+        robot.calibrator = CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
-                graph.Parameter(name, value=value)
+                Parameter(name, value=value)
                 for name, value in {**QUICK, 'output_directory': str(folder), **parameters}.items()])
         robot.executor.add_node(robot.calibrator)
         try:

@@ -3,6 +3,8 @@
 
 """Messages of trials whose truth the toy knows."""
 
+import functools
+
 import numpy as np
 from toy_simulator import toy_trial
 
@@ -25,9 +27,14 @@ SECOND = 10**9
 MINUTE = 60 * SECOND
 
 
+@functools.cache
+def _toy(k: int) -> Trial:
+    return toy_trial(TRUTH, f'trial {k + 1}', turn=0.4 * k)
+
+
 def toy_trials(count: int) -> list[Trial]:
     """Return `count` different trials of one DLO."""
-    return [toy_trial(TRUTH, f'trial {k + 1}', turn=0.4 * k) for k in range(count)]
+    return [_toy(k) for k in range(count)]
 
 
 def trial_messages(types: MessageTypes, trial: Trial, stamp: int, frame_id: str = 'world') -> list:
