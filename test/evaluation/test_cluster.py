@@ -30,6 +30,8 @@ PATHS = os.pathsep.join([str(ROOT), str(ROOT / 'test/support'), os.environ.get('
 
 def dask(part, *words, **environment):
     """Start a part of a cluster as a process of its own."""
+    # What a dead worker had found is asked of it for 30 s, unless Dask is told otherwise.
+    environment = {'DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT': '5s', **environment}
     return subprocess.Popen(
         [sys.executable, '-m', f'distributed.cli.dask_{part}', '--host', '127.0.0.1', '--no-dashboard',
          *words], env={**os.environ, 'PYTHONPATH': PATHS, **environment}, cwd='/', stderr=subprocess.DEVNULL)
