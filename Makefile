@@ -4,10 +4,11 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help demo experiment test lint bench clean
+.PHONY: help demo experiment test lint bench figures clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
+MEASURED := $(wildcard $(or $(DLO_DATA),../shared/data))
 LINT := test/test_lint.py test/test_copyright.py test/test_architecture.py test/test_packaging.py
 
 ifeq ($(shell test "$${ROS_DISTRO-}" = jazzy && python3 -c 'import rclpy' 2>/dev/null && echo yes),yes)
@@ -34,7 +35,8 @@ help:
 	  make test    run all tests
 	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables
 	  make lint    run the checks of style, types, imports and packaging alone
-	  make bench   measure speed, memory and start-up, and compare the engines
+	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
+	  make figures make all tables of benchmark/results: make bench, and then some hours
 	  make clean   remove .venv and everything that was built
 	END
 
@@ -45,7 +47,7 @@ experiment: $(STAMP)
 	@$(PYTHON) -m dlo_calibration experiment
 
 test: $(STAMP)
-	@$(PYTHON) -m pytest
+	@$(PYTHON) -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal --durations 10
 
 lint: $(STAMP)
 	@$(PYTHON) -m pytest $(LINT)
@@ -55,6 +57,14 @@ bench: $(STAMP)
 	  $(PYTHON) -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(PYTHON) -m pytest benchmark
 	$(PYTHON) benchmark/agreement.py
+	for name in $(if $(MEASURED),estimates discretisation accuracy); do $(PYTHON) benchmark/$$name.py; done
+	$(if $(MEASURED),,echo 'DLO_DATA names no folder: the tables of measured objects are not made again.')
+
+figures: bench
+	@$(PYTHON) benchmark/searches.py
+	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
+	cp build/experiment/experiment.md benchmark/results/experiment.md
+	for name in $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
 
 clean:
 	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

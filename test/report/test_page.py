@@ -9,6 +9,7 @@ import hashlib
 from html import escape, unescape
 from html.parser import HTMLParser
 import math
+import os
 from pathlib import Path
 import re
 import shutil
@@ -203,7 +204,8 @@ def browse(tmp_path_factory):
     """Give a function that calls a browser with a profile of its own, and returns what it prints."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
-        pytest.skip(f'none of {", ".join(BROWSERS)} is installed')
+        missing = pytest.fail if os.environ.get('CI') else pytest.skip
+        missing(f'none of {", ".join(BROWSERS)} is installed')
     profile = tmp_path_factory.mktemp('profile')
 
     def browse(*arguments):
