@@ -15,7 +15,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 def calibrated(trials, budget=200, **rest):
     options = Options(calibrate=EVEN.free, parts=0, evaluations=budget)
-    return fitted(Setting(tuple(trials), options, CompiledSimulator(table=False), **rest))
+    return fitted(Setting(tuple(trials), options, CompiledSimulator(table=False, nodes=21), **rest))
 
 
 @pytest.fixture(scope='module')
@@ -52,7 +52,8 @@ def test_every_evaluation_is_counted_and_told_in_the_parts_that_were_found(found
 def test_the_same_in_parts_is_the_same_dlo(found):
     result, seen = found
     even = result.evaluations[0]
-    again = Evaluator(result.trials, result.space, CompiledSimulator(table=False)).evaluate(0, even.point)
+    simulator = CompiledSimulator(table=False, nodes=21)
+    again = Evaluator(result.trials, result.space, simulator).evaluate(0, even.point)
     assert again.score == pytest.approx(seen[even.index].score, rel=1e-6)
 
 

@@ -11,9 +11,11 @@ import time
 
 from processes import children
 import pytest
+from toy_messages import session_messages, write_session
 
 from dlo_calibration.cli.demo import samples
 from dlo_calibration.files.session import read_session
+from dlo_calibration.messages.codec import bag_types
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('pybullet', reason='needs PyBullet')
@@ -28,7 +30,10 @@ def demo(environment, *arguments):
 
 
 def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path):
-    process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '4')
+    sample = write_session(tmp_path / 'sample', session_messages(bag_types(), 1), {
+        'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01})
+    process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '4',
+                   '--sample', str(sample))
     output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     for word in ('flexibility', 'N m^2', 'mean error', 'demo.png'):

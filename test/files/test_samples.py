@@ -114,7 +114,7 @@ def test_yaml_messages_show_the_first_trial_of_object1(types):
 
 
 def test_yaml_messages_calibrate(types):
-    simulator = BulletSimulator(nodes=31, time_step=0.004)
+    simulator = BulletSimulator(nodes=12, time_step=0.01)
     result = fitted(sample_trials(sample_messages(types)), ParameterSpace(mass=0.03), simulator,
                        RandomSearch(4, seed=1), budget=2)
     simulator.close()

@@ -245,7 +245,7 @@ def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     assert topics.robot.status['trials'] == '2'
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6), good_last=st.booleans())
 def test_mutated_bytes_in_a_file_end_in_a_result_or_one_line(tmp_path_factory, command, messages, good_last):
     path = tmp_path_factory.mktemp('mutated') / 'session.mcap'

@@ -37,7 +37,7 @@ def observed(space, values):
     """Return four trials of a DLO with these values, with half a millimetre of noise in what follows."""
     trials = [carried(0.1, 0.2), carried(0.25, 0.0), carried(-0.1, 0.3), carried(0.0, -0.2)]
     noise = np.random.default_rng(4)
-    rollouts = Evaluator(trials, space, CompiledSimulator(table=False)).simulate(values)
+    rollouts = Evaluator(trials, space, CompiledSimulator(table=False, nodes=21)).simulate(values)
     return [replace(trial, goals=tuple(
         replace(goal, chain=Chain(points + noise.normal(0, 5e-4, points.shape)))
         for goal, points in zip(trial.goals, rollout.chains, strict=True)))
