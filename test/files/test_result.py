@@ -91,7 +91,7 @@ def test_everything_else_comes_back(file, result):
     assert (found.trials, found.warnings) == (('trial 1', 'trial 2'), result.warnings)
     np.testing.assert_array_equal(found.chain.points, result.trials[0].initial.points)
     assert found.chain.hands is None and not found.chain.features.any()
-    assert found.options == OPTIONS
+    assert Options.of(found.options) == OPTIONS
 
 
 def test_writing_what_was_read_gives_the_same_bytes(file):
