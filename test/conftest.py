@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 
+from drawings import leave_out_drawings
 import pytest
 from toy_simulator import ToySimulator
 from wire import SOURCES
@@ -76,6 +77,12 @@ def shared_ros_environment(tmp_path_factory) -> Iterator[Mapping[str, str]]:
     """Give a ROS graph to the tests of one module together."""
     with ros_graph(tmp_path_factory.mktemp('graph')) as environment:
         yield environment
+
+
+@pytest.fixture
+def without_drawings(monkeypatch):
+    """Leave the drawings of pages out."""
+    leave_out_drawings(monkeypatch)
 
 
 @pytest.fixture(params=SOURCES)

@@ -4,6 +4,7 @@
 """Imports run one way, and heavy libraries stay where they belong."""
 
 import ast
+import functools
 import importlib
 import os
 from pathlib import Path
@@ -43,7 +44,8 @@ def room(file: Path) -> str:
     return file.relative_to(FOLDER).parts[0] if file.parent != FOLDER else ''
 
 
-def imported(file: Path) -> set[str]:
+@functools.cache
+def imported(file: Path) -> frozenset[str]:
     """List the full names that a file imports, anywhere in it."""
     names = set()
     for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
@@ -53,10 +55,10 @@ def imported(file: Path) -> set[str]:
             assert node.level == 0, f'{file.name}: line {node.lineno} imports relatively'
             names.add(node.module)
             names.update(f'{node.module}.{alias.name}' for alias in node.names)
-    return names
+    return frozenset(names)
 
 
-def rooms_of(names: set[str]) -> set[str]:
+def rooms_of(names: frozenset[str]) -> set[str]:
     """List the rooms that imported names are in."""
     return {name.split('.')[1] for name in names if name.startswith(f'{PACKAGE}.')} & set(ROOMS)
 

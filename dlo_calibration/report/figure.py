@@ -30,7 +30,7 @@ LABEL_WIDTH = 64  # characters that fit into a panel's legend
 LEGEND_LINE, BAR_ROOM = 0.17, 0.8  # in, of a line of that legend, and beside the axes for a bar of colours
 #: Matplotlib's settings are the process's own, and its fonts are not made for threads.
 _LOCK = threading.Lock()
-SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'path', 'axes.spines.top': False,
+SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'none', 'axes.spines.top': False,
             'axes.spines.right': False, 'axes.titley': 1.0, 'axes.axisbelow': True}
 
 

@@ -29,6 +29,8 @@ from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INITIAL
 
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
 FIT_KEYS = {
     'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',
     'error_percent_of_length', 'trials', 'evaluations', 'simulations', 'seconds', 'engine', 'search', 'seed',

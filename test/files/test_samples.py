@@ -25,6 +25,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
 SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
 DOCUMENTS = ('README.md', 'make_yaml.py', 'make_xml.py')
 SESSIONS = sorted(file.parent for file in SAMPLES.glob('*/metadata.yaml'))

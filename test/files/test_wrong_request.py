@@ -25,6 +25,8 @@ from dlo_calibration.files import recording
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INITIAL
 
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)
 

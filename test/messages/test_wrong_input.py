@@ -26,6 +26,8 @@ from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)
 SCORES = {}  # of what was calibrated

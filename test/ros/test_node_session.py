@@ -20,6 +20,8 @@ from dlo_calibration.messages.codec import bag_types, INITIAL, INPUT_TYPES
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
 from dlo_calibration.ros.session import CalibrationSession
 
+pytestmark = pytest.mark.usefixtures('without_drawings')
+
 PATIENCE = 60.0  # s
 TYPES = bag_types()
 

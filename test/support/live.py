@@ -5,6 +5,8 @@
 
 from contextlib import contextmanager
 
+from drawings import leave_out_drawings
+import pytest
 from toy_simulator import ToySimulator
 
 QUICK = {'calibrate': ['flexibility', 'friction'], 'evaluations': 4, 'workers': 1}
@@ -19,7 +21,8 @@ def live_node(environment, folder, toy=None, **parameters):
 
     from dlo_calibration.ros.calibrator_node import CalibratorNode
 
-    with robot_of(environment) as robot:
+    with robot_of(environment) as robot, pytest.MonkeyPatch.context() as patch:
+        leave_out_drawings(patch)
         robot.calibrator = CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
                 Parameter(name, value=value)

@@ -1,0 +1,13 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pages without drawings, for tests of something else: each drawing takes a tenth of a second."""
+
+from dlo_calibration.report.figure import Panel
+
+
+def leave_out_drawings(patch):
+    """Let the page of a result have its words only; `patch` is a `pytest.MonkeyPatch`."""
+    for module in ('drawing', 'landscape'):
+        patch.setattr(f'dlo_calibration.report.{module}.panel',
+                      lambda draw, words, legend=True: Panel('data:,', words))
