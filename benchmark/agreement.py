@@ -21,7 +21,7 @@ from figures import SAMPLES, table, write
 import numpy as np
 
 from dlo_calibration import SimulationError, Trial
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.bullet import BulletSimulator
@@ -45,7 +45,7 @@ def reference_trials() -> list[tuple[str, float, Trial]]:
         else:
             session = read_session(SAMPLES / name)
             options = session.options
-            found += [(name, options.mass, trial) for trial in session_trials(session, options)[0]]
+            found += [(name, options.mass, trial) for trial in session.trials]
     return found
 
 

@@ -14,6 +14,7 @@ is printed, and written to benchmark/results/elastica.md.
 
 from __future__ import annotations
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import subprocess
@@ -25,9 +26,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.optimize import least_squares
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.simulation.compiled import CompiledSimulator
@@ -96,9 +96,8 @@ class Elastica:
 def simulated(session: Path, nodes: int) -> tuple[float, float, float]:
     """Return stiffness [N m^2], length by the measured one, and the root mean square distance [m]."""
     read = read_session(session)
-    options = Options.of({**(read.options or {}), 'calibrate': ['flexibility', 'length_scale']})
-    trials, _ = session_trials(read, options)
-    evaluator = Evaluator(trials, options.space, CompiledSimulator(table=False, nodes=nodes))
+    options = replace(read.options, calibrate=('flexibility', 'length_scale'))
+    evaluator = Evaluator(read.trials, options.space, CompiledSimulator(table=False, nodes=nodes))
     search = LeastSquares(2, 1, Hints.at(np.array([0.55, 0.5])))
     while len(points := search.ask(100)):
         found = [evaluator.evaluate(0, point) for point in points]

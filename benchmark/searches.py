@@ -15,6 +15,7 @@ end.  The table is printed, and written to benchmark/results/searches.md.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import prior
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.robust import Huber
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.search import Observation, SEARCHES
 
 HERE = Path(__file__).resolve().parent
@@ -52,9 +53,8 @@ def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
 def rows_of(name: str, names: list[str], seeds: int, engine: str) -> list[str]:
     """Tabulate all searches on one object."""
     session = read_session(HERE.parent / 'msg_samples' / name, None)
-    options = Options.of({**Options().flat(), **(session.options or {}), 'engine': engine})
-    trials, _ = session_trials(session, options)
-    evaluator = Evaluator(trials, options.space, make_simulator(options))
+    options = replace(session.options, engine=engine)
+    evaluator = Evaluator(session.trials, options.space, make_simulator(options))
     done = {one: [search_with(evaluator, options, one, seed) for seed in range(seeds)]
             for one in dict.fromkeys(['random', *names])}
     target = float(np.median([min(one.score for one in seen) for seen, _ in done['random']]))

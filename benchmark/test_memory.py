@@ -12,7 +12,7 @@ import pytest
 
 from dlo_calibration import SimulationError
 from dlo_calibration.evaluation.processes import ProcessExecutor
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 
 #: engine -> rounds
 ROUNDS = {'compiled': 10_000, 'bullet': 1_000}
@@ -34,7 +34,7 @@ def memory(name, rounds):
         from dlo_calibration.simulation.bullet import BulletSimulator as Engine
     session = read_session(SAMPLES / 'object1')
     options = session.options
-    trials, _ = session_trials(session, options)
+    trials = session.trials
     simulator, generator, looks = Engine(), np.random.default_rng(1), []
     for k in range(rounds):
         values = options.space.values(generator.uniform(size=options.space.dimension))

@@ -17,7 +17,7 @@ from dlo_calibration.calibration.fit import fit
 from dlo_calibration.calibration.options import ENGINES, Options
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
@@ -51,7 +51,7 @@ def sample():
     """Return trials and parameter space of object 1."""
     session = read_session(SAMPLES / 'object1')
     options = session.options
-    return session_trials(session, options)[0], options.space
+    return session.trials, options.space
 
 
 @pytest.mark.benchmark(timer=time.perf_counter)

@@ -9,7 +9,7 @@ from figures import SAMPLES, side_by_side, table, write
 import numpy as np
 import pytest
 
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
@@ -26,7 +26,7 @@ def object1():
     """Return the four trials of object 1 and its physical parameters."""
     session = read_session(SAMPLES / 'object1')
     options = session.options
-    trials, _ = session_trials(session, options)
+    trials = session.trials
     return trials, options.space.physical(VALUES, trials[0].initial.length)
 
 
