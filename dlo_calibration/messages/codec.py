@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import MAXIMUM_HANDS, MAXIMUM_NORM, MINIMUM_NORM, quaternion_lengths
+from dlo_calibration.model.action import far_from_unit, MAXIMUM_HANDS, quaternion_lengths
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
@@ -146,9 +146,8 @@ class ActionMessage:
                 f'time_from_start {times[k + 1]:.9g} s of trajectory point {k + 1} after {times[k]:.9g} s',
                 f'increasing times, by {MINIMUM_STEP:g} s at least',
                 'sort the points and leave out repeated ones')
-        # one bound with Hand, which normalises
         norms = quaternion_lengths(orientations)
-        wrong = np.argwhere((norms < MINIMUM_NORM) | (norms > MAXIMUM_NORM))
+        wrong = np.argwhere(far_from_unit(norms))
         if len(wrong):
             k, h = wrong[0]
             raise InputError(

@@ -1,41 +1,44 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Action: what hands did to a DLO, as time-stamped paths."""
+"""Action: the time-stamped paths of the hands that move a DLO."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
 
-MAXIMUM_HANDS = 8
-MINIMUM_NORM, MAXIMUM_NORM = 0.5, 1000.0  # of a quaternion, which need not be normalised, but must be finite
-NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
-ROUNDING = 1e-12  # of the length of a unit quaternion
+MAXIMUM_HANDS = 8  # the limit of the message contract
+NO_ROTATION = (0.0, 0.0, 0.0, 1.0)  # x y z w
 
 
 def quaternion_lengths(orientations: Floats) -> Floats:
-    """Return the lengths of quaternions, (..., 4), also where their squares are no finite numbers."""
+    """Return the lengths of (..., 4) quaternions, also of those whose squares overflow."""
     largest = np.abs(orientations).max(axis=-1, initial=1.0)
     lengths: Floats = largest * np.linalg.norm(orientations / largest[..., None], axis=-1)
     return lengths
 
 
+def far_from_unit(lengths: Floats) -> NDArray[np.bool_]:
+    """Tell which quaternions cannot be meant as rotations; rounded ones can, as they are normalised here."""
+    return (lengths < 0.5) | (lengths > 1000)
+
+
 @dataclass(frozen=True, eq=False)
 class Hand:
     """
-    One gripper hand: which points it grips, and the path it moves on.
+    One gripper hand: the points that it grips, and its path.
 
     It closes at its first waypoint.  Between waypoints it moves on the shortest
-    path at constant speed.  One gripped point is a pin; two or more are a clamp:
-    they move as one rigid piece with the hand.
+    path at constant speed.  One gripped point is a pin; two or more are a clamp,
+    which moves with the hand as one rigid piece.
 
-    :param name: as on the wire, e.g. ``left_hand``.
+    :param name: its name in the messages, e.g. ``left_hand``.
     :param grips: indices of the gripped points of the chain, at least one.
     :param times: (k,) seconds since the start of the trial, increasing, k >= 1.
     :param positions: (k, 3) [m].
@@ -46,7 +49,7 @@ class Hand:
     grips: tuple[int, ...]
     times: Floats
     positions: Floats
-    orientations: Floats = None  # type: ignore[assignment]  # no rotation; an array once built
+    orientations: Floats = None  # type: ignore[assignment]  # __post_init__ makes it an array
 
     def __post_init__(self) -> None:
         thing = f'hand {self.name!r}'
@@ -69,14 +72,14 @@ class Hand:
             raise InputError(thing, 'waypoints whose times do not increase', 'increasing times',
                              'sort the waypoints and remove repeated ones')
         norms = quaternion_lengths(orientations)[:, None]
-        bad = norms[(norms < MINIMUM_NORM) | (norms > MAXIMUM_NORM)]
+        bad = norms[far_from_unit(norms)]
         if len(bad):
             raise InputError(thing, f'a quaternion of length {bad[0]:.2g}', 'a unit quaternion x y z w',
                              'use 0 0 0 1 for a hand that does not turn')
         object.__setattr__(self, 'grips', tuple(dict.fromkeys(int(g) for g in self.grips)))
         object.__setattr__(self, 'times', times)
         object.__setattr__(self, 'positions', positions)
-        norms[np.abs(norms - 1) < ROUNDING] = 1  # dividing again would change the last digit
+        norms[np.abs(norms - 1) < 1e-12] = 1  # dividing again would change the last digit
         object.__setattr__(self, 'orientations', frozen_array(orientations / norms))
 
     @property
@@ -90,20 +93,20 @@ class Hand:
         return float(self.times[-1])
 
     def positions_at(self, at: ArrayLike) -> Floats:
-        """Return where the hand is at `at`, (m,) [s] -> (m, 3) [m]; it rests before its path and after."""
+        """Return positions, (m, 3) [m], at times `at`, (m,) [s]; the hand rests before and after its path."""
         times = np.atleast_1d(np.asarray(at, dtype=float))
         return np.stack([np.interp(times, self.times, axis) for axis in self.positions.T], axis=1)
 
     def poses(self, at: ArrayLike) -> tuple[Floats, Floats]:
         """
-        Return where the hand is at `at`, (m,) [s], and how it has turned.
+        Return the poses of the hand at the times `at`, (m,) [s].
 
-        :returns: (m, 3) positions [m] and (m, 3, 3) rotation matrices since it closed.
+        :returns: (m, 3) positions [m], and (m, 3, 3) rotations since the hand closed.
         """
         times = np.clip(np.atleast_1d(np.asarray(at, dtype=float)), self.start, self.end)
         if (self.orientations == NO_ROTATION).all():
             return self.positions_at(times), np.tile(np.eye(3), (len(times), 1, 1))
-        from scipy.spatial.transform import Rotation, Slerp  # a quarter of a second, that few need
+        from scipy.spatial.transform import Rotation, Slerp  # takes a quarter of a second to load
 
         turns = Rotation.from_quat(self.orientations)
         turned = Slerp(self.times, turns)(times) if len(self.times) > 1 else turns[np.zeros(len(times), int)]
@@ -112,7 +115,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Action:
-    """What up to eight hands did together."""
+    """The paths of one to eight hands that act together."""
 
     hands: tuple[Hand, ...]
 

@@ -15,9 +15,8 @@ from dlo_calibration.errors import InputError
 
 Floats = NDArray[np.float64]
 
-MINIMUM_POINTS = 3
-MINIMUM_SPACING = 1e-6  # m; points nearer than that are the same point
-SAMPLES_PER_SEGMENT = 16  # of the arc length table; error below 1e-4 of a segment
+MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
+SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
 
 
 def frozen_array(values: ArrayLike, dtype: type = float) -> NDArray[Any]:
@@ -71,13 +70,13 @@ class Chain:
 
     :param points: (n, 3) positions [m], n >= 3, finite, neighbours apart.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
-        None where the source does not tell.
+        None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.
     """
 
     points: Floats
     hands: NDArray[np.uint8] | None = None
-    features: NDArray[np.bool_] = None  # type: ignore[assignment]  # none marked; an array once built
+    features: NDArray[np.bool_] = None  # type: ignore[assignment]  # __post_init__ makes it an array
 
     def __post_init__(self) -> None:
         points = frozen_array(self.points)
@@ -85,9 +84,9 @@ class Chain:
             raise InputError(
                 'chain', f'points of shape {points.shape}', 'an array of shape (n, 3)',
                 'give one x y z row per point')
-        if len(points) < MINIMUM_POINTS:
+        if len(points) < 3:
             raise InputError(
-                'chain', f'{len(points)} point(s)', f'at least {MINIMUM_POINTS}',
+                'chain', f'{len(points)} point(s)', 'at least 3',
                 'send the points along the whole DLO, first to last')
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
@@ -123,11 +122,11 @@ class Chain:
         return float(self.arc_lengths()[-1])
 
     def arc_lengths(self) -> Floats:
-        """Place of each point along the curve through them, (n,) [m], from 0."""
+        """Arc length at each point, (n,) [m], from 0."""
         return self._arc_length_table()[1][::SAMPLES_PER_SEGMENT]
 
     def resample(self, arc_lengths: ArrayLike) -> Floats:
-        """Points of the curve at places along it, (m,) [m] -> (m, 3) [m]."""
+        """Return the points of the curve, (m, 3) [m], at the given arc lengths, (m,) [m]."""
         parameters, along = self._arc_length_table()
         at = np.interp(np.asarray(arc_lengths, dtype=float), along, parameters)
         return bezier_curve(self._knots(), self.points, at)
@@ -137,7 +136,7 @@ class Chain:
         return np.concatenate([[0.0], np.cumsum(chords)])
 
     def _arc_length_table(self) -> tuple[Floats, Floats]:
-        """Curve parameters, and the arc length [m] at each of them."""
+        """Return parameters of the curve, and the arc length [m] at each of them."""
         knots = self._knots()
         fractions = np.arange(SAMPLES_PER_SEGMENT) / SAMPLES_PER_SEGMENT
         parameters = np.append((knots[:-1, None] + np.diff(knots)[:, None] * fractions).ravel(), knots[-1])

@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Named actions: what to do with a DLO, in words; each becomes what the hands do.
+Named actions: short descriptions of manipulations, from which the paths of the hands follow.
 
-On the wire an action is always what the hands did.  A named action is the short
-way to say it: given the chain before it, `action` returns the paths of the hands.
-A hand closes where the chain is and moves at constant speed.  `hold` says whether
-it still holds the DLO afterwards.
+A message always carries the paths themselves.  A named action computes them from the
+chain before it: each hand closes at the point that it grips, and moves at constant
+speed.  With `hold` it keeps holding the DLO afterwards.
 
-The position of a hand [m] is that of the point that it grips.  That point is given
+The position of a hand [m] is that of the point that it grips.  This point is given
 as an index of the chain (negative: from its end), or as a fraction of the length,
-which means the point of the chain nearest to it.  A target is given as coordinates,
+which selects the nearest point of the chain.  A target is given as coordinates,
 or as a direction (of any length) and a distance.
 
-Each action says what it shows of each of the paper's four parameters, and what it does not.
+The docstring of each action tells how much it shows of each of the paper's four parameters.
 """
 
 from __future__ import annotations
@@ -31,20 +30,18 @@ from dlo_calibration.model.chain import Chain, Floats
 Numbers = tuple[float, ...]
 
 UP = np.array([0.0, 0.0, 1.0])
-LEAST, MOST = 1e-9, 1e6  # m, m/s, s: limits of distances, speeds and times, far beyond what a robot does
-NO_TIME = 1e-9  # s: a shorter move is left out, as the times of its waypoints could be the same float
-APART, TOGETHER = 'apart', 'together'
-#: Which of two hands moves -> the share of the distance that each of them moves by.
+MOST = 1e6  # m, m/s, s: limit of distances, speeds and times, far beyond those of any robot
+#: Which of two hands moves -> the share of the distance that each of them covers.
 MOVING = {'both': (0.5, 0.5), 'first': (1.0, 0.0), 'second': (0.0, 1.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class NamedAction:
     """
-    What all named actions share.
+    The fields and checks that all named actions share.
 
     :param start: when the hands close, seconds since the start of the trial.
-    :param hold: the hands hold the DLO afterwards; else they open at the end of their path.
+    :param hold: True: the hands hold the DLO afterwards; False: they open at the end of their path.
     """
 
     start: float = 0.0
@@ -63,7 +60,7 @@ class NamedAction:
             raise self._refused(f'start {self.start:g} s', f'0 to {MOST:g} s')
         for name in ('speed', 'height', 'distance'):
             value = getattr(self, name, None)
-            if value is not None and not LEAST <= value <= MOST and not (
+            if value is not None and not 1e-9 <= value <= MOST and not (
                     name == 'height' and value == 0 and self.may_be_flat):
                 raise self._refused(f'{name} {value:g}', f'a {name} above 0, of at most {MOST:g}')
 
@@ -80,11 +77,11 @@ class NamedAction:
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """
-        Return what the hands do.
+        Return the paths of the hands.
 
-        :param chain: the DLO as it is when the hands close.
-        :param before: earlier actions of the trial, in order; only `Release` asks for them.
-        :raises InputError: where it cannot be done with this chain.
+        :param chain: the DLO when the hands close.
+        :param before: earlier actions of the trial, in order; only `Release` needs them.
+        :raises InputError: where the action is impossible with this chain.
         """
         raise NotImplementedError
 
@@ -92,13 +89,13 @@ class NamedAction:
         return InputError(f'action {self.name}', came, expected, remedy)
 
     def _require_one(self, one: str, other: str, remedy: str) -> None:
-        """Refuse two fields that are both given, or both left out."""
+        """Raise an error unless exactly one of two fields is given."""
         values = getattr(self, one), getattr(self, other)
         if (values[0] is None) == (values[1] is None):
             raise self._refused(f'{one} {values[0]}, {other} {values[1]}', 'one of the two', remedy)
 
     def _grip(self, chain: Chain, point: int | None, fraction: float | None) -> int:
-        """Return the index, from 0, of the point at an index, or nearest to a fraction of the length."""
+        """Return the index, from 0, of the gripped point, given by an index or a fraction of the length."""
         if point is not None:
             count = len(chain)
             if not -count <= point < count:
@@ -130,18 +127,18 @@ class _OneHand(NamedAction):
         self._require_one('point', 'fraction', 'say where the hand grips')
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the path of the hand at its speed, without the waypoints where it is already."""
+        """Return the path of the hand at constant speed, without repeated waypoints."""
         grip = self._grip(chain, self.point, self.fraction)
         way = [chain.points[grip]]
         for point in self._way(way[0]):
-            if np.linalg.norm(point - way[-1]) > NO_TIME * self.speed:
+            if np.linalg.norm(point - way[-1]) > 1e-9 * self.speed:  # in 1 ns, times may round to one float
                 way.append(point)
         durations = np.linalg.norm(np.diff(way, axis=0), axis=1) / self.speed
         times = self.start + np.concatenate([[0.0], np.cumsum(durations)])
         return Action((Hand(self.hand, (grip,), times, np.array(way)),))
 
     def _way(self, point: Floats) -> Sequence[Floats]:
-        """Return the waypoints, (3,) [m] each, after the gripped point."""
+        """Return the waypoints, (3,) [m] each, that follow the gripped point."""
         raise NotImplementedError
 
 
@@ -152,7 +149,7 @@ class _Carrying(_OneHand):
 
     :param to: coordinates x y z [m]; or
     :param direction: x y z, of any length, and
-    :param distance: [m] in it.
+    :param distance: in this direction [m].
     """
 
     to: Numbers | None = None
@@ -177,7 +174,7 @@ class _Carrying(_OneHand):
     def _target(self, point: Floats) -> Floats:
         if self.to is not None:
             return np.array(self.to)
-        # The largest component first: the square of a tiny or a huge one would not be finite.
+        # Divide by the largest component first: squares of huge or tiny numbers overflow or vanish.
         direction = np.array(self.direction) / np.abs(self.direction).max()  # type: ignore[arg-type]
         target: Floats = point + direction / np.linalg.norm(direction) * self.distance
         return target
@@ -188,11 +185,11 @@ class GraspAndPlace(_Carrying):
     """
     Lift a point, carry it through the air, put it down and open.
 
-    The hand goes up by `height` above the higher one of the two places, across, and down to the target.
+    The hand rises to `height` above the higher one of the two places, moves across, and down to the target.
 
-    flexibility: some, together with friction: the bends that stay near the placed point are those which
-        friction can hold against bending.
-    elasticity: nothing: nothing pulls at the other end but friction.
+    flexibility: some, together with friction: near the placed point, those bends stay that friction can hold
+        against the bending stiffness.
+    elasticity: nothing: only friction pulls at the other end.
     friction: some, together with flexibility: how much of the DLO follows.
     self_collision: nothing, unless the point is placed on or across the DLO (folding it); then much.
 
@@ -212,11 +209,11 @@ class Drag(_Carrying):
     """
     Pull a point straight to a target, along the table, and open.
 
-    flexibility: much, together with friction: how wide the bend beside the point is. Dragging an end along
-        the DLO tells next to nothing.
+    flexibility: much, together with friction: how wide the bend beside the point is. Almost nothing where
+        an end is dragged along the DLO.
     elasticity: nothing: friction alone is too weak to stretch a DLO visibly.
     friction: much, together with flexibility: how much of the DLO follows, and where it stops. An end dragged
-        along the DLO tells some of friction alone. Fast hands add inertia to it.
+        along the DLO shows some of friction alone. With fast hands, inertia matters too.
     self_collision: nothing, unless the DLO is dragged against itself.
     """
 
@@ -229,9 +226,9 @@ class LiftAndHold(_OneHand):
     """
     Lift a point straight up and hold it there.
 
-    flexibility: much, and little else, so that it is the action to begin with: how the free part bends under
-        its weight. Without a known mass, only the ratio of both. Where a limp DLO hangs straight down, only
-        that it is limp.
+    flexibility: much, and almost separately from the others, so begin with this action: how the free part
+        bends under its weight. Without a known mass, only the ratio of stiffness and weight. Where a limp DLO
+        hangs straight down, only that it is limp.
     elasticity: nothing, unless the DLO stretches visibly under its weight.
     friction: some: how far the part on the table was pulled in. Nothing where all of it hangs.
     self_collision: nothing, unless two hanging parts touch.
@@ -249,18 +246,18 @@ class LiftAndHold(_OneHand):
 @dataclass(frozen=True, kw_only=True)
 class PushDown(_OneHand):
     """
-    Push a raised point straight down, and stay there.
+    Push a raised point straight down and hold it there.
 
-    For a DLO that another hand holds up, or that bridges a gap.  A point that lies
-    on the table cannot be pushed down.
+    This needs a DLO that another hand holds up, or that bridges a gap: a point on the
+    table cannot be pushed down.
 
     flexibility: much: the shape between the pushed point and what holds the DLO up.
-    elasticity: some, where both sides of the point are held and the DLO is pushed beyond straight; nothing
-        else.
+    elasticity: some, where the DLO is held on both sides of the point and pushed beyond straight; otherwise
+        nothing.
     friction: some: how far the part on the table is pushed out or pulled in.
     self_collision: nothing, unless the point is pushed onto the DLO.
 
-    :param distance: that the hand moves down [m].
+    :param distance: by which the hand moves down [m].
     """
 
     distance: float = 0.05
@@ -273,31 +270,31 @@ class PushDown(_OneHand):
 @dataclass(frozen=True, kw_only=True)
 class TwoHands(NamedAction):
     """
-    Grip two points, lift both, and move them apart or together; hold them there.
+    Grip two points, lift both, move them apart or together, and hold them there.
 
-    Hands move on the line through both points.
+    The hands move along the line through both points.
 
-    flexibility: together on the table: some, how it buckles. In the air: little, as a DLO that hangs from two
-        points sags much the same whatever its stiffness, unless it is stiff. Apart: the less, the straighter
-        it gets.
-    elasticity: apart, beyond the straight DLO: the only action that shows it, if the distance between the
-        hands stretches the DLO by more than the error of observation. Else nothing.
+    flexibility: together on the table: some, how the DLO buckles. In the air: little, unless the DLO is
+        stiff: the sag between two hands hardly depends on a low stiffness. Apart: the straighter the DLO
+        gets, the less.
+    elasticity: apart: this is the only action that shows it, if the hands stretch the DLO by more than the
+        noise of the points. Otherwise nothing.
     friction: on the table, together: some. In the air, or apart: nothing.
-    self_collision: together, until parts touch: some. Else nothing.
+    self_collision: together, until parts touch: some. Otherwise nothing.
 
     :param points: indices of the two gripped points; or
     :param fractions: of the length, 0 to 1, where the hands grip.
     :param motion: `apart` or `together`.
     :param distance: by which the distance between the hands changes [m].
     :param moving: `both` hands by half of it, or the `first` or `second` hand alone.
-    :param height: of a lift of both hands before that [m]; 0: on the table.
-    :param speed: of each hand that moves [m/s].
-    :param hands: the two names.
+    :param height: by which both hands rise before that [m]; 0: they stay on the table.
+    :param speed: of each moving hand [m/s].
+    :param hands: their two names.
     """
 
     points: tuple[int, ...] | None = None
     fractions: Numbers | None = None
-    motion: str = TOGETHER
+    motion: str = 'together'
     distance: float = 0.1
     moving: str = 'both'
     height: float = 0.0
@@ -316,13 +313,13 @@ class TwoHands(NamedAction):
                 raise self._refused(f'{len(values)} {name}', '2', 'give one for each hand')
         if self.fractions is not None:
             object.__setattr__(self, 'fractions', tuple(float(one) for one in self.fractions))
-        if self.motion not in (APART, TOGETHER):
-            raise self._refused(f'motion {self.motion!r}', f'{APART} or {TOGETHER}')
+        if self.motion not in ('apart', 'together'):
+            raise self._refused(f'motion {self.motion!r}', 'apart or together')
         if self.moving not in MOVING:
             raise self._refused(f'moving {self.moving!r}', f'one of {", ".join(MOVING)}')
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return the paths of both hands, with waypoints at the same times."""
+        """Return the paths of both hands, whose waypoints have the same times."""
         grips = [self._grip(chain, point, fraction) for point, fraction in zip(
             self.points or (None, None), self.fractions or (None, None), strict=True)]
         if grips[0] == grips[1]:
@@ -331,13 +328,13 @@ class TwoHands(NamedAction):
         begin = chain.points[grips]
         between = begin[1] - begin[0]
         gap = float(np.linalg.norm(between))
-        if self.motion == TOGETHER and self.distance > gap:
+        if self.motion == 'together' and self.distance > gap:
             raise self._refused(f'{self.distance:g} m together of hands {gap:.4g} m apart',
                                 'less than their distance', 'choose a smaller distance')
         if gap == 0:
             raise self._refused('two points at the same place', 'two places', 'grip elsewhere')
         shares = MOVING[self.moving]
-        step = between / gap * (self.distance if self.motion == TOGETHER else -self.distance)
+        step = between / gap * (self.distance if self.motion == 'together' else -self.distance)
         up = begin + self.height * UP
         end = up + np.array([shares[0] * step, -shares[1] * step])
         way, times = [begin], [self.start]
@@ -352,14 +349,14 @@ class TwoHands(NamedAction):
 @dataclass(frozen=True, kw_only=True)
 class Release(NamedAction):
     """
-    Open hands that an earlier action left holding, where they are.
+    Open hands that still hold the DLO after an earlier action, where they are.
 
-    flexibility: much, after a lift: the bends that remain when it has fallen. The motion itself tells
-        damping, if timed goals show it.
-    elasticity: nothing, unless it was stretched before and timed goals show how it springs back.
-    friction: some: which bends the table keeps. What was bent with the hands on the table, and springs back,
-        tells the most.
-    self_collision: some where it falls onto itself; nothing else.
+    flexibility: much, after a lift: the bends that remain when the DLO has fallen. Timed goals also show
+        damping, during the fall.
+    elasticity: nothing, unless the DLO was stretched before and timed goals show how it springs back.
+    friction: some: the bends that the table keeps. It shows most where a DLO that was bent on the table
+        springs back.
+    self_collision: some where the DLO falls onto itself; otherwise nothing.
 
     :param hands: names of the hands that open.
     """
@@ -372,7 +369,7 @@ class Release(NamedAction):
             raise self._refused('hold', 'hands that open', 'leave hold out')
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
-        """Return one waypoint for each hand: where it came to rest, holding the same points."""
+        """Return one waypoint for each hand, at its last position, with the same gripped points."""
         last = {hand.name: hand for action in before for hand in action.hands}
         opened = []
         for name in self.hands:
@@ -388,7 +385,7 @@ class Release(NamedAction):
         return Action(tuple(opened))
 
 
-#: By the names of the elements in a request.
+#: Name of the element in a request -> class.
 NAMED_ACTIONS: Mapping[str, type[NamedAction]] = {
     'grasp_and_place': GraspAndPlace,
     'drag': Drag,

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameters: the paper's 0..100 scale and the physical quantity behind each.
+Parameters: their values on the paper's scale from 0 to 100, and their physical quantities.
 
-Everything inside the package is in SI units; 0..100 exists here and at the
-edges (messages, files, tables).  Adding a parameter is one entry of PARAMETERS;
+The package computes in SI units; the scale from 0 to 100 exists here and at the
+edges (messages, files, tables).  A new parameter is one more entry of PARAMETERS;
 an engine reads its physical value by name.
 """
 
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats
 
-SCALE = 100.0
+SCALE = 100.0  # the upper end of the paper's scale
 GRAVITY = 9.81  # m/s^2
-ASSUMED_DENSITY = 0.05  # kg/m, of a DLO whose mass is not known
-PER_WEIGHT = 'per N/m'  # end of the unit of what is divided by the weight per length
+ASSUMED_DENSITY = 0.05  # kg/m, of a DLO of unknown mass, about that of a polyester rope of 8 mm
+PER_WEIGHT = 'per N/m'  # ends the unit of a stiffness that is divided by the weight per length
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Parameter:
 
     :param at_zero: physical value at 0.
     :param at_hundred: physical value at 100.
-    :param default: value on the 0..100 scale where it is not calibrated.
-    :param linear: True where the scale is linear, else it is logarithmic.
-    :param neutral: exact physical value at the default, for a parameter that has no effect
-        there (1 for a ratio; 0, which a logarithmic scale does not have).
+    :param default: value on the 0..100 scale of a parameter that is neither found nor fixed.
+    :param linear: True for a linear scale, False for a logarithmic one.
+    :param neutral: exact physical value at the default, where the parameter has no effect
+        there: 1 for a ratio, or 0, which a logarithmic scale does not contain.
     :param per_weight: True if motion under gravity depends only on the ratio of this
-        parameter to the DLO's weight; without a known mass, that ratio is reported.
+        parameter to the DLO's weight; this ratio is reported where the mass is unknown.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Parameter:
     neutral: float | None = None
 
     def physical(self, value: float) -> float:
-        """Physical value of `value` on the 0..100 scale."""
+        """Return the physical value, in `unit`, of `value` on the 0..100 scale."""
         if self.neutral is not None and value == self.default:
             return self.neutral
         if self.linear:
@@ -62,7 +62,7 @@ class Parameter:
         return self.at_zero * math.pow(self.at_hundred / self.at_zero, value / SCALE)
 
     def value(self, physical: float) -> float:
-        """Value on the 0..100 scale (beyond it too) of a physical value; > 0 on a logarithmic one."""
+        """Return the value on the 0..100 scale, or beyond it, of a physical one (> 0 if logarithmic)."""
         if physical == self.neutral:
             return self.default
         if self.linear:
@@ -70,15 +70,15 @@ class Parameter:
         return SCALE * math.log(physical / self.at_zero) / math.log(self.at_hundred / self.at_zero)
 
 
-MOST_PARTS = 8  # of a DLO, that have a bending stiffness of their own
+MOST_PARTS = 8  # with bending stiffnesses of their own: the DLO can be halved three times
 
 
 def part_name(part: int) -> str:
-    """Name the parameter of a part of the DLO, counted from 1; the first has `flexibility`."""
+    """Return the name of the stiffness of a part of the DLO, counted from 1; part 1 has `flexibility`."""
     return 'flexibility' if part == 1 else f'stiffness_{part}'
 
 
-#: The paper's four, then what is fixed by default.
+#: The paper's four, then those that are fixed by default.
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter('flexibility', 'bending stiffness EI', 'N m^2', 10**-1.0, 10**-5.5, 50.0,
               'how easily the DLO bends', per_weight=True),
@@ -114,15 +114,14 @@ PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 @dataclass(frozen=True)
 class ParameterSpace:
     """
-    Which parameters a calibration finds, and where the others stay.
+    The parameters that a calibration finds, and the values of the others.
 
-    The DLO has as many parts of equal length as the highest `stiffness_...` that is
-    free or fixed says; one, where there is none.
+    The DLO has k parts of equal length where `stiffness_k` is the highest such name
+    that is free or fixed; it has one part where there is none.
 
     :param free: names of the parameters to find, in order.
-    :param fixed: values of others on the 0..100 scale; those not named keep
-        their default.
-    :param mass: kg of the whole DLO; 0 where it is not known.
+    :param fixed: values of others on the 0..100 scale; the rest keep their defaults.
+    :param mass: of the whole DLO [kg]; 0: unknown.
     """
 
     free: tuple[str, ...] = PAPER_PARAMETERS
@@ -158,15 +157,15 @@ class ParameterSpace:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The entries of the table that this DLO has: all but those of parts that it has not."""
+        """The entries of PARAMETERS, without the stiffnesses of parts that this DLO does not have."""
         absent = PART_NAMES[self.parts - 1:]
         return tuple(parameter for parameter in PARAMETERS if parameter.name not in absent)
 
     def divided(self, parts: int) -> ParameterSpace:
         """
-        Return the space of a DLO of that many parts of equal length.
+        Return the space of a DLO with `parts` parts of equal length.
 
-        Where `flexibility` is free, so is the stiffness of every other part.
+        Where `flexibility` is free, the stiffnesses of all other parts are free too.
         """
         absent = PART_NAMES[parts - 1:]
         free = tuple(name for name in self.free if name not in absent)
@@ -179,11 +178,11 @@ class ParameterSpace:
         return ParameterSpace(free, fixed, self.mass)
 
     def halved(self, point: Sequence[float] | Floats) -> tuple[ParameterSpace, NDArray[np.float64]]:
-        """Return the space with every part cut in two, and its point that is the same DLO as a (d,) point."""
+        """Cut every part in two; return the new space, and its (e,) point of the same DLO as the (d,) `point`."""
         space = self.divided(2 * self.parts)
         values = {**self.fixed, **self.values(point)}
         for part in range(2, space.parts + 1):
-            whole = part_name((part + 1) // 2)  # the first has no ratio: it is the measure
+            whole = part_name((part + 1) // 2)  # part 1 is what the ratios relate to
             values[part_name(part)] = BY_NAME[part_name(part)].default if whole == 'flexibility' else \
                 self.fixed.get(whole, self.values(point).get(whole, BY_NAME[whole].default))
         return space, space.point(values)
@@ -194,15 +193,15 @@ class ParameterSpace:
         return self.mass > 0 or 'mass' in self.free or 'mass' in self.fixed
 
     def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
-        """Return the free parameters, 0..100, of a (d,) point of the unit cube."""
+        """Return the free parameters on the 0..100 scale at a (d,) point of the unit cube."""
         return {name: float(u) * SCALE for name, u in zip(self.free, point, strict=True)}
 
     def point(self, values: Mapping[str, float]) -> NDArray[np.float64]:
-        """Return the (d,) point of the unit cube of free parameters on 0..100."""
+        """Return the (d,) point of the unit cube at free parameters on the 0..100 scale."""
         return np.array([values[name] / SCALE for name in self.free])
 
     def default_point(self) -> NDArray[np.float64]:
-        """Return the (d,) point of the unit cube where nothing is found: what is fixed, else the default."""
+        """Return the (d,) point of the unit cube at the fixed values and, for the other parameters, the defaults."""
         return self.point({name: self.fixed.get(name, BY_NAME[name].default) for name in self.free})
 
     def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:
@@ -210,7 +209,7 @@ class ParameterSpace:
         Return the physical value of every parameter that the DLO has, by name.
 
         :param values: free parameters on the 0..100 scale.
-        :param length: of the DLO [m], for the mass where that is not known.
+        :param length: of the DLO [m], from which an unknown mass is assumed.
         """
         physical = {p.name: p.physical(values.get(p.name, self.fixed.get(p.name, p.default)))
                     for p in self.parameters}
@@ -222,8 +221,8 @@ class ParameterSpace:
         """
         Return the physical value to report for `value` on 0..100, and its unit.
 
-        Where the mass is not known, a stiffness is given divided by the DLO's
-        weight per length, which is what gravity-driven motion determines.
+        Where the mass is unknown, a stiffness is divided by the DLO's weight per
+        length, as motion under gravity determines only this ratio.
         """
         parameter = BY_NAME[name]
         physical = parameter.physical(value)

@@ -22,9 +22,9 @@ def exact(value: Any) -> str:
 
 def number(value: float | None) -> str:
     """
-    Return a number with three significant digits, for people; a dash where it is not known.
+    Return a number with three significant digits, for people; a dash where it is unknown.
 
-    It has a power of ten only where it is very large or very small.
+    Only a very large or very small number has a power of ten.
     """
     if value is None or not math.isfinite(value):
         return '-'
@@ -36,7 +36,7 @@ def number(value: float | None) -> str:
 
 
 def measured(value: float | None, unit: str) -> str:
-    """Return a physical value (SI) with its unit, for people: a length in mm, a coefficient without unit."""
+    """Return a physical value (SI) with its unit, for people: lengths in mm, coefficients without unit."""
     return _joined([value], unit)
 
 

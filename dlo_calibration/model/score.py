@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Goal, Trial
 
-SIMILAR = 100.0  # below: similar, by the paper's judges
-VERY_SIMILAR = 50.0
-CENTIMETRES = 100.0
+SIMILAR = 100.0  # cm; the paper's judges call chains with lower scores similar
+VERY_SIMILAR = 50.0  # cm, likewise
 
 
 def focal_point(trial: Trial, goal: Goal) -> int:
     """
-    Return the index of the paper's p_ref.
+    Return the index of the focal point, the paper's p_ref.
 
-    The goal's point nearest to a hand that holds it, else the first point.
+    It is the point of the goal that is nearest to a hand that holds the DLO, else the first point.
     """
     best, index = np.inf, 0
     for hand in trial.holding(goal):
@@ -38,7 +37,7 @@ def feature_points(trial: Trial, goal: Goal) -> NDArray[np.intp]:
     """
     Return the indices of the geometric features of a goal.
 
-    Local maxima and minima in z of the goal, points that a hand gripped, and
+    They are local maxima and minima in z, points that a hand has gripped, and
     points that an annotator marked.
     """
     z = goal.chain.points[:, 2]
@@ -57,10 +56,10 @@ def difference_score(goal: Floats, current: Floats, reference: int,
     Return the paper's difference score, equation (1), in centimetres.
 
     ``D = || sum_i (|p_ref - p_i|_goal - |p_ref - p_i|_curr) + sum_f |p_f_goal - p_f_curr| ||``
-    with |.| of a vector taken component by component, i over all points and f
-    over the features.  The differences of the first sum keep their sign, as in
-    the paper: those of opposite sign cancel.  So a score of 0 does not prove
-    that two chains are equal; the point errors beside it do.
+    where |.| of a vector is taken component by component, i runs over all points
+    and f over the features.  As in the paper, differences of opposite sign cancel
+    in the first sum, so a score of 0 does not prove that two chains are equal; a
+    point error of 0 does.
 
     :param goal: (n, 3) [m] observed points.
     :param current: (n, 3) [m] simulated points.
@@ -71,11 +70,11 @@ def difference_score(goal: Floats, current: Floats, reference: int,
     shape_current = np.abs(current[reference] - current)
     shape = (shape_goal - shape_current).sum(axis=0)
     place = np.abs(goal[features] - current[features]).sum(axis=0)
-    return float(np.linalg.norm(shape + place)) * CENTIMETRES
+    return float(np.linalg.norm(shape + place)) * 100
 
 
 class TrialScore:
-    """The difference score of one trial; what depends on its goals alone is found once."""
+    """The difference score of one trial; the terms of its goals are computed once."""
 
     def __init__(self, trial: Trial) -> None:
         self._points = np.stack([goal.chain.points for goal in trial.goals])
@@ -86,7 +85,7 @@ class TrialScore:
         self._shape = self._extent(self._points)
 
     def _extent(self, chains: Floats) -> Floats:
-        """Return (g, 3) [m]: the sums over the points of |p_ref - p_i| by coordinate."""
+        """Return the sums over the points of |p_ref - p_i| by coordinate, (g, 3) [m]."""
         references = chains[np.arange(len(chains)), self._reference]
         return np.asarray(np.abs(references[:, None, :] - chains).sum(axis=1))
 
@@ -96,12 +95,7 @@ class TrialScore:
             raise ValueError(f'chains of shape {chains.shape}, expected {self._points.shape}')
         place = np.einsum('gi,gij->gj', self._features, np.abs(self._points - chains))
         difference = self._shape - self._extent(chains) + place
-        return float(np.linalg.norm(difference, axis=1).mean()) * CENTIMETRES
-
-
-def trial_score(trial: Trial, chains: Floats) -> float:
-    """Return the difference score of simulated (g, n, 3) chains, averaged over the g goals."""
-    return TrialScore(trial)(chains)
+        return float(np.linalg.norm(difference, axis=1).mean()) * 100
 
 
 def residuals(trial: Trial, chains: Floats) -> Floats:
@@ -111,14 +105,14 @@ def residuals(trial: Trial, chains: Floats) -> Floats:
 
 
 def distances(residual: Floats) -> Floats:
-    """Return (p,) [m] how far each simulated point is from the observed one, of residuals (3 p,) [m]."""
+    """Return the distances of simulated from observed points, (p,) [m], of a residual vector, (3 p,) [m]."""
     return np.asarray(np.linalg.norm(residual.reshape(-1, 3), axis=1))
 
 
 @dataclass(frozen=True)
 class PointErrors:
     """
-    Errors over all goal points; points that a hand holds count too.
+    Errors over all goal points, including those that a hand holds.
 
     :param mean: mean Euclidean distance [m].
     :param rms: root of the mean squared distance [m].

@@ -13,18 +13,16 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 
-INSTANTS = 5  # goals shown at most where a trial has many
-
 
 @dataclass(frozen=True)
 class Goal:
     """
     The DLO as it was observed during or after an action.
 
-    :param chain: point i is the same material point as point i of the initial chain.
+    :param chain: its point i is the same material point as point i of the initial chain.
     :param time: seconds since the start of the trial.
-    :param stable: True where the simulated DLO is compared when it came to rest
-        after `time`; False where it is compared at that instant.
+    :param stable: True: the simulated DLO is compared when it has come to rest
+        after `time`; False: it is compared at that instant.
     :param held_by: names of the hands that still hold the DLO in this goal.
     """
 
@@ -37,13 +35,13 @@ class Goal:
 @dataclass(frozen=True)
 class Trial:
     """
-    One observed manipulation: where the DLO was, what hands did, where it went.
+    One observed manipulation: the DLO before it, the actions of the hands, and the observed goals.
 
-    :param initial: the DLO before the action; its points' places along the
-        curve are the material coordinates of all chains of the trial.
+    :param initial: the DLO before the action; the arc lengths of its points are
+        the material coordinates of all chains of the trial.
     :param actions: one or more, in the order of their start.
     :param goals: one or more, in the order of their time.
-    :param velocity: (n, 3) [m/s] of the initial points; None: at rest.
+    :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
     """
 
     name: str
@@ -97,12 +95,12 @@ class Trial:
         return tuple(hand for hand in last.values() if self.holds(hand, goal))
 
     def holds(self, hand: Hand, goal: Goal) -> bool:
-        """Tell whether `hand` holds the DLO when `goal` is observed, or one of its name that took over."""
+        """Tell whether `hand`, or a later path of the same name, holds the DLO when `goal` is observed."""
         if goal.time <= hand.end:
             return goal.time >= hand.start
         return hand.name in goal.held_by
 
 
 def shown_goals(count: int) -> list[int]:
-    """Return the indices of the goals to show of `count`: evenly spread, the last one always."""
-    return sorted({int(k) for k in np.linspace(count - 1, 0, min(count, INSTANTS)).round()})
+    """Return the indices of at most five of `count` goals to show, evenly spread, always with the last."""
+    return sorted({int(k) for k in np.linspace(count - 1, 0, min(count, 5)).round()})

@@ -20,7 +20,7 @@ from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.model.score import PointErrors, residuals, trial_score
+from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.report.page import Origin, write_report
 from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.ros import diagnostics
@@ -68,7 +68,7 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.mean_distance == pytest.approx(0.004)
     assert other.max_distance == pytest.approx(0.004)
     moved = [chains + (0, 0.004, 0) for chains in after.chains]
-    assert other.scores == pytest.approx([trial_score(*one) for one in zip(after.trials, moved, strict=True)])
+    assert other.scores == pytest.approx([TrialScore(one[0])(one[1]) for one in zip(after.trials, moved, strict=True)])
     assert other.score == pytest.approx(np.mean(other.scores))
     residual = np.concatenate([residuals(*one) for one in zip(after.trials, moved, strict=True)])
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
@@ -235,4 +235,4 @@ def test_truth_is_where_the_toy_says():
     """Both engines agree at the truth itself, with scores of nothing."""
     trial, = toy_trials(1)
     physical = ParameterSpace().physical(TRUTH, trial.initial.length)
-    assert trial_score(trial, SecondToy().simulate(trial, physical).chains) == pytest.approx(0, abs=1e-9)
+    assert TrialScore(trial)(SecondToy().simulate(trial, physical).chains) == pytest.approx(0, abs=1e-9)

@@ -13,7 +13,7 @@ from dlo_calibration.model.score import (
     focal_point,
     PointErrors,
     residuals,
-    trial_score,
+    TrialScore,
 )
 
 STRAIGHT = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
@@ -117,9 +117,9 @@ def test_the_score_of_a_trial_is_the_average_over_its_goals():
     two = trial(STRAIGHT, *goals)
     # The grip 0 is the only feature: 1 cm away in the second goal.
     chains = np.stack([STRAIGHT, STRAIGHT + (0, 0, 0.01)])
-    assert trial_score(two, chains) == pytest.approx(0.5)
+    assert TrialScore(two)(chains) == pytest.approx(0.5)
     with pytest.raises(ValueError):
-        trial_score(two, chains[:1])
+        TrialScore(two)(chains[:1])
 
 
 def test_residuals_are_simulated_minus_observed_goal_by_goal():
