@@ -178,7 +178,7 @@ class ParameterSpace:
         return ParameterSpace(free, fixed, self.mass)
 
     def halved(self, point: Sequence[float] | Floats) -> tuple[ParameterSpace, NDArray[np.float64]]:
-        """Cut every part in two; return the new space, and its (e,) point of the same DLO as the (d,) `point`."""
+        """Return the space with every part cut in two, and its point for the DLO at the (d,) `point`."""
         space = self.divided(2 * self.parts)
         values = {**self.fixed, **self.values(point)}
         for part in range(2, space.parts + 1):
@@ -201,7 +201,7 @@ class ParameterSpace:
         return np.array([values[name] / SCALE for name in self.free])
 
     def default_point(self) -> NDArray[np.float64]:
-        """Return the (d,) point of the unit cube at the fixed values and, for the other parameters, the defaults."""
+        """Return the (d,) point of the unit cube at the fixed values and, for the others, the defaults."""
         return self.point({name: self.fixed.get(name, BY_NAME[name].default) for name in self.free})
 
     def physical(self, values: Mapping[str, float], length: float) -> dict[str, float]:

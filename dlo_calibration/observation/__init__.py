@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What observed chains say before anything is simulated: noise, what lies and hangs, prior estimates."""
+"""Estimates from observed chains alone, without simulation: noise, resting and hanging parts, prior."""
 
 from dlo_calibration.observation.estimate import prior_estimates, PriorEstimate
 from dlo_calibration.observation.excitation import excites

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Prior estimates: what the observed chains say of the parameters before anything is simulated."""
+"""Prior estimates: values and bounds of the parameters from observed chains alone, without simulation."""
 
 from __future__ import annotations
 
@@ -18,28 +18,20 @@ from dlo_calibration.observation.hanging import Balance, balance, hanging_parts
 from dlo_calibration.observation.noise import noise, smooth
 from dlo_calibration.observation.table import RESTING_BAND, resting_level
 
-SIGMAS = 3.0  # of noise that a range leaves room for
-STIFFNESS_MARGIN = 2.0  # factor, either way, for natural curvature, twist and all that is left out
-FRICTION_MARGIN = 3.0  # factor, for what smoothing does to the curvature of a resting DLO
-RADIUS_MARGIN = 1.2  # factor, for cut corners
-UNKNOWN_NOISE = 2e-3  # m, of chains with too few points to tell
-SMALLEST_NOISE = 2e-4  # m, of points that seem to have none: the model is not better than that
-LYING = 0.003  # m above the level, at least: below it a point may touch the table
-SMOOTHER = 1.3  # times the noise: too smooth a curve bends less, which leaves bounds true
-VISIBLE = 5.0  # times the noise
-SAMPLES = 160  # of a curve, about
-SHORTEST = 0.5  # of the DLO, of a stretch whose straightening is looked at
-RADII = 60  # that are tried
+SIGMAS = 3.0  # standard deviations of the noise by which bounds are widened
+STIFFNESS_MARGIN = 2.0  # factor, either way, for natural curvature, twist and other effects left out
+FRICTION_MARGIN = 3.0  # factor: smoothing changes the curvature of a resting DLO
+SAMPLES = 160  # steps along a resampled curve
 
 
 @dataclass(frozen=True)
 class PriorEstimate:
     """
-    What the observed chains say of one parameter, on the 0..100 scale.
+    Estimate of one parameter on the 0..100 scale, from observed chains alone.
 
-    :param value: nan where they do not tell one.
-    :param lower: the true value is not below it, as far as the model holds; 0 where nothing is known.
-    :param upper: the true value is not above it; 100 where nothing is known.
+    :param value: nan where the chains do not determine one.
+    :param lower: lower bound of the true value, as far as the model holds; 0 where nothing is known.
+    :param upper: upper bound of the true value, likewise; 100 where nothing is known.
     """
 
     value: float = math.nan
@@ -53,12 +45,12 @@ UNKNOWN = PriorEstimate()
 @dataclass(frozen=True)
 class _Resting:
     """
-    What all chains at rest say together.
+    The ratios that all chains at rest determine together.
 
-    :param load: w / EI [1/m^3] of the hanging parts: best, least and most.
-    :param stretch: w / EA [1/m] of them: best, least and most.
-    :param parts: how many hang.
-    :param hold: mu w / EI that keeps the DLO bent on the table, at least [1/m^3]; 0: nothing lies bent.
+    :param load: w / EI [1/m^3] of the hanging parts: estimate, lower and upper bound.
+    :param stretch: w / EA [1/m] of the hanging parts: estimate, lower and upper bound.
+    :param parts: number of hanging parts.
+    :param hold: least mu w / EI that keeps the DLO bent on the table [1/m^3]; 0: no chain lies bent.
     """
 
     load: tuple[float, float, float]
@@ -72,17 +64,18 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
     """
     Estimate the free parameters from the observed chains alone.
 
-    Flexibility and elasticity follow from the balance of moments of the parts that hang
-    (see `hanging`), with three standard deviations of the noise and a factor of two
-    either way. Friction holds a DLO bent on the table against its stiffness: a third of
-    what the curve needs is a lower bound. Parts that are no neighbours were seen no
-    nearer than twice the self-collision radius: an upper bound. The other parameters do
-    not show in chains at rest.
+    Flexibility and elasticity follow from the balance of moments of hanging parts
+    (see `hanging`); their bounds leave three standard deviations of the noise and a
+    factor of two either way. Friction keeps a DLO bent on the table against its
+    stiffness: a third of the friction that the curve needs is a lower bound. The
+    smallest observed distance between parts that are not neighbours is an upper bound
+    of twice the self-collision radius. Chains at rest do not show the other parameters.
 
     :param table_height: [m]; None where there is no table.
     """
     sigma = noise(trials)
-    sigma = UNKNOWN_NOISE if math.isnan(sigma) else max(SMALLEST_NOISE, sigma)
+    # 2 mm where chains have too few points to estimate it; at least 0.2 mm, as the model is no better.
+    sigma = 2e-3 if math.isnan(sigma) else max(2e-4, sigma)
     length = float(np.median([trial.initial.length for trial in trials]))
     resting = _resting(trials, table_height, sigma)
     known = {'friction': _friction(resting), 'self_collision': _self_collision(trials, table_height, sigma)}
@@ -93,13 +86,13 @@ def prior_estimates(trials: Sequence[Trial], space: ParameterSpace,
 
 
 def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Floats:
-    """Return the (d,) estimates in the unit cube, nan where there is none; the arguments are as above."""
+    """Return the `prior_estimates` as a (d,) point of the unit cube, nan where there is none."""
     found = prior_estimates(trials, space, table_height)
     return frozen_array([one.value / SCALE for one in found.values()])
 
 
 def _scaled(name: str, value: float, lowest: float, highest: float) -> PriorEstimate:
-    """Return the estimate for a physical value > 0, or nan, and for its physical range, within the scale."""
+    """Return the estimate of a physical value (> 0, or nan) and its bounds, clipped to the scale."""
     def scaled(physical: float) -> float:
         return min(SCALE, max(0.0, BY_NAME[name].value(physical)))
 
@@ -109,7 +102,7 @@ def _scaled(name: str, value: float, lowest: float, highest: float) -> PriorEsti
 
 
 def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) -> _Resting:
-    """Look at all chains at rest."""
+    """Combine the balances of all hanging parts, and the friction that all lying chains need."""
     balances: list[Balance] = []
     hold = 0.0
     for trial in trials:
@@ -118,7 +111,7 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) 
         level = None if table_height is None else resting_level(trial, table_height)
         if level is None and table_height is not None:
             level = table_height
-        margin = max(LYING, SIGMAS * sigma)
+        margin = max(0.003, SIGMAS * sigma)  # m; a lower point may touch the table
         lying = [trial.initial] if trial.velocity is None else []
         for goal in trial.goals:
             if not goal.stable:
@@ -137,41 +130,41 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) 
         for chain in lying:
             if level is not None and (chain.points[:, 2] < level + RESTING_BAND + SIGMAS * sigma).all() \
                     and not _near_itself(chain.points, places, sigma):
-                hold = max(hold, _straightening(_smoothed(chain, sigma), VISIBLE * sigma))
+                hold = max(hold, _straightening(_smoothed(chain, sigma), 5 * sigma))
     return _Resting(_combined([(b.load, b.std) for b in balances]),
                     _combined([(b.stretch, b.stretch_std) for b in balances]), len(balances), hold)
 
 
 def _smoothed(chain: Chain, sigma: float) -> Chain:
-    """Return a chain without as much of its roughness as is noise."""
-    smoothed = smooth(chain.points, SMOOTHER * sigma)
+    """Return a chain without its noise, rather too smooth: less bending leaves the bounds true."""
+    smoothed = smooth(chain.points, 1.3 * sigma)
     steps = np.linalg.norm(np.diff(smoothed, axis=0), axis=1)
     return Chain(smoothed) if (steps > MINIMUM_SPACING).all() else chain
 
 
 def _combined(found: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
-    """Return the weighted mean of values with their standard deviations, and its range; nan of none."""
+    """Return the weighted mean of (value, standard deviation) pairs, and its bounds; nan if there is none."""
     usable = [(value, std) for value, std in found if np.isfinite(value) and np.isfinite(std) and std > 0]
     if not usable:
         return math.nan, -math.inf, math.inf
     values, stds = np.array(usable).T
     weights = stds**-2 / np.sum(stds**-2)
     mean = float(weights @ values)
-    scatter = float(np.sqrt(weights @ (values - mean)**2))  # of repeats, which share their flaws
+    scatter = float(np.sqrt(weights @ (values - mean)**2))  # repeats share systematic errors
     std = max(float(np.sum(stds**-2)**-0.5), scatter)
     return mean, max(mean, 0.0) - SIGMAS * std, max(mean, 0.0) + SIGMAS * std
 
 
 def _straightening(chain: Chain, visible: float) -> float:
     """
-    Return the least friction per weight, over EI, that keeps a lying DLO bent [1/m^3].
+    Return the least mu w / EI that keeps a lying DLO bent [1/m^3].
 
-    By virtual work: where a stretch from a point to one end straightens a
-    little, in proportion to its bend, the bending energy falls by EI times the
-    integral of the squared curvature, and friction takes at most mu w times the
-    path of every point.
+    By virtual work: when the stretch from a point to one end straightens a little,
+    in proportion to its bend, the bending energy falls by EI times the integral of
+    the squared curvature, and friction dissipates at most mu w times the integral
+    of the paths of its points.  Stretches of half the DLO or more are tried.
 
-    :param visible: a bend whose points would move less than that, on average, is noise [m].
+    :param visible: a bend is noise if straightening it would move its points by less on average [m].
     """
     places = np.linspace(0, chain.length, SAMPLES + 1)
     step = places[1]
@@ -182,7 +175,7 @@ def _straightening(chain: Chain, visible: float) -> float:
         angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
         curvature = np.gradient(angle, step)
-        for first in range(0, int((1 - SHORTEST) * SAMPLES) + 1, 8):
+        for first in range(0, SAMPLES // 2 + 1, 8):
             turn = angle[first:] - angle[first]
             path = np.linalg.norm(np.cumsum(turn[:, None] * normal[first:], axis=0) * step, axis=1)
             work = float(path.sum())
@@ -192,7 +185,7 @@ def _straightening(chain: Chain, visible: float) -> float:
 
 
 def _apart(chain: Chain) -> tuple[Floats, Floats]:
-    """Return how far apart all pairs of points of a curve are: along it and in space, (p,) [m] each."""
+    """Return the distances of all pairs of points of a curve, along it and in space, (p,) [m] each."""
     places = np.linspace(0, chain.length, SAMPLES + 1)
     points = chain.resample(places)
     first, second = np.triu_indices(len(points), 1)
@@ -200,7 +193,7 @@ def _apart(chain: Chain) -> tuple[Floats, Floats]:
 
 
 def _near_itself(points: Floats, places: Floats, sigma: float) -> list[int]:
-    """List the points that may touch another part of the DLO."""
+    """Return the indices of points that may touch another part of the DLO."""
     largest = BY_NAME['self_collision'].at_hundred
     along = np.abs(places[:, None] - places[None, :])
     space = np.linalg.norm(points[:, None] - points[None, :], axis=2)
@@ -210,7 +203,7 @@ def _near_itself(points: Floats, places: Floats, sigma: float) -> list[int]:
 
 
 def _flexibility(resting: _Resting, weight: float) -> PriorEstimate:
-    """Return the estimate for a DLO of that weight per length [N/m]."""
+    """Return the estimate for a weight per length [N/m]."""
     load, low, high = resting.load
     parameter = BY_NAME['flexibility']
     lowest, highest = parameter.at_hundred, parameter.at_zero
@@ -224,7 +217,7 @@ def _flexibility(resting: _Resting, weight: float) -> PriorEstimate:
 
 
 def _elasticity(resting: _Resting, weight: float) -> PriorEstimate:
-    """Return the estimate for a DLO of that weight per length [N/m]."""
+    """Return the estimate for a weight per length [N/m]."""
     stretch, low, high = resting.stretch
     if not math.isfinite(high):
         return UNKNOWN
@@ -238,25 +231,25 @@ def _friction(resting: _Resting) -> PriorEstimate:
     if resting.hold == 0 or not load > 0:
         return UNKNOWN
     most = BY_NAME['friction'].at_hundred
-    halfway = math.sqrt(min(most, resting.hold / load) * most)  # on the scale, from the least that holds it
+    halfway = math.sqrt(min(most, resting.hold / load) * most)  # of the bounds, on the scale
     lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
     return _scaled('friction', halfway, lowest, most)
 
 
 def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: float) -> PriorEstimate:
     parameter = BY_NAME['self_collision']
-    radii = np.geomspace(parameter.at_zero, parameter.at_hundred, RADII)
-    allowed = np.ones(RADII, bool)
+    radii = np.geomspace(parameter.at_zero, parameter.at_hundred, 60)  # 5 % apart
+    allowed = np.ones(len(radii), bool)
     for trial in trials:
-        seen = shown_goals(len(trial.goals))  # of hundreds, a few: it is a bound, the fewer the wider
+        seen = shown_goals(len(trial.goals))  # a few of hundreds: fewer make the bound wider, not wrong
         for chain in (trial.initial, *(trial.goals[k].chain for k in seen)):
             along, space = _apart(chain)
             spacing = float(np.linalg.norm(np.diff(chain.points, axis=0), axis=1).max())
-            room = space * RADIUS_MARGIN + SIGMAS * sigma
-            for k in np.flatnonzero(allowed):  # parts nearer along the DLO cannot touch, see `contact`
+            room = space * 1.2 + SIGMAS * sigma  # a chain cuts corners
+            for k in np.flatnonzero(allowed):  # nearer parts cannot touch, see `self_contact`
                 apart = along > np.pi * radii[k] + spacing
                 allowed[k] = not bool((room[apart] < 2 * radii[k]).any())
-    # A radius is allowed or not at each size; the largest allowed one bounds it.
+    # A larger radius may be allowed though a smaller one is not; the largest allowed one is the bound.
     largest = float(radii[np.flatnonzero(allowed).max(initial=0)])
     levels = [] if table_height is None else [
         level - table_height for trial in trials for level in [resting_level(trial, table_height)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Excitation: which parameters a trial can tell anything about, before anything is simulated."""
+"""Excitation: which parameters a trial can show, judged without simulation."""
 
 from __future__ import annotations
 
@@ -15,19 +15,13 @@ from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import noise
 
-CLEAR = 0.1  # m above the table, and the length of the hands' paths: surely not touched
-NEAR = 1.5  # largest diameters: parts that stay further apart surely do not touch
-FOLDED = 0.8  # of the distance along the DLO: no bend brings parts nearer whose distance is a larger share
-BETWEEN = 9  # chains looked at from one observed chain to the next
-SLACK = 0.9  # of the distance along the DLO: hands that are nearer do not pull it
-PULL = 4.0  # weights of the DLO that one hand, which drags and swings it, pulls with at most
-UNSEEN = 0.2  # of the noise: a smaller change is not seen
+BETWEEN = 9  # interpolated chains from one observed chain to the next
 
 
 def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None
             ) -> NDArray[np.bool_]:
     """
-    Return which free parameters each trial can show, (T, d): False only where it surely cannot.
+    Return which free parameters each trial can show, (T, d); False only where it surely cannot.
 
     :param table_height: [m]; None where there is no table.
     """
@@ -50,22 +44,22 @@ def _chains(trial: Trial) -> list[Floats]:
 
 
 def _reaches(trial: Trial, table_height: float | None) -> bool:
-    """Tell whether a DLO may touch the table: where it hung low, or hands moved far."""
+    """Tell whether the DLO may touch the table: it hangs low, or hands move it far."""
     if table_height is None:
         return False
     lowest = min(float(points[:, 2].min()) for points in _chains(trial))
     travel = max(float(np.linalg.norm(np.diff(hand.positions, axis=0), axis=1).sum()) for hand in trial.hands)
     swing = 0.0 if trial.velocity is None else trial.initial.length
-    return lowest < table_height + CLEAR + travel + swing
+    return lowest < table_height + 0.1 + travel + swing  # 0.1 m to spare
 
 
 def _comes_near_itself(trial: Trial) -> bool:
     """
-    Tell whether parts that are no neighbours may have touched.
+    Tell whether parts that are not neighbours may have touched.
 
-    Looked at are the observed chains, chains between them, and the way of each hand past them.
+    It checks the observed chains, chains interpolated between them, and the path of each hand past them.
     """
-    reach = NEAR * 2 * BY_NAME['self_collision'].at_hundred
+    reach = 1.5 * 2 * BY_NAME['self_collision'].at_hundred  # 1.5 of the largest diameter
     places = trial.initial.arc_lengths()
     along = np.abs(places[:, None] - places[None, :])
     spacing = float(np.diff(places).max())
@@ -74,7 +68,8 @@ def _comes_near_itself(trial: Trial) -> bool:
     between = np.concatenate([a + steps * (b - a) for a, b in zip(chains[:-1], chains[1:], strict=True)])
 
     def near(distance: Floats, apart: Floats) -> bool:
-        return bool(((distance < reach + spacing) & (distance < FOLDED * apart)).any())
+        # A pair that is further apart than 0.8 of its arc length is not folded back to touch.
+        return bool(((distance < reach + spacing) & (distance < 0.8 * apart)).any())
 
     for points in between:
         if near(np.linalg.norm(points[:, None] - points[None, :], axis=2), along):
@@ -89,16 +84,17 @@ def _comes_near_itself(trial: Trial) -> bool:
 
 
 def _may_stretch(trial: Trial, space: ParameterSpace, sigma: float) -> bool:
-    """Tell whether the DLO may have been stretched measurably, were it as elastic as the scale goes."""
+    """Tell whether the hands may have stretched a DLO of the greatest elasticity measurably."""
     hands, length = trial.hands, trial.initial.length
     places = trial.initial.arc_lengths()
     for k, hand in enumerate(hands):
         for other in hands[k + 1:]:
             times = np.linspace(min(hand.start, other.start), max(hand.end, other.end), 4 * BETWEEN)
             apart = np.linalg.norm(hand.positions_at(times) - other.positions_at(times), axis=1).max()
-            if apart > SLACK * np.ptp(places[[*hand.grips, *other.grips]]):
+            if apart > 0.9 * np.ptp(places[[*hand.grips, *other.grips]]):  # else the DLO between is slack
                 return True
     if np.isnan(sigma) or 'mass' in space.free or any(not goal.stable for goal in trial.goals):
         return True
     weight = space.physical({}, length)['mass'] * GRAVITY
-    return bool(PULL * weight / BY_NAME['elasticity'].at_hundred * length > UNSEEN * sigma)
+    # A hand that drags and swings the DLO pulls with at most 4 weights; 0.2 of the noise is not seen.
+    return bool(4 * weight / BY_NAME['elasticity'].at_hundred * length > 0.2 * sigma)

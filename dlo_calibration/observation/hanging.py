@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Suspension: parts of a DLO that hang in the air at rest, and what their shape says of its stiffness."""
+"""Suspension: the stiffness of a DLO from the shape of its parts that hang in the air at rest."""
 
 from __future__ import annotations
 
@@ -13,31 +13,19 @@ import numpy as np
 
 from dlo_calibration.model.chain import bezier_curve, Floats
 
-STEPS = 200  # of the integration, about
-FEWEST_STEPS = 3  # per segment
-ITERATIONS = 6  # of the shape that moments are taken along
-CONVERGED = 0.02  # of the noise
-FEWEST_ROWS = 6  # coordinates measured beyond the number of unknowns
-WINDOW = 7  # segments of a window, at least
-WINDOWS = (1, 2, 4, 8)  # numbers of windows that are tried
-AGREES = 2.0  # standard deviations
-FITS = 1.5  # times the noise: residuals up to that are noise
-RANK = {'free': 0, 'pin': 1, 'unknown': 2}  # unknown vectors of an end
-NOISY = 1.7  # factor on formal deviations: the shape along which moments are taken is noisy too
-STRAIN = 0.05  # of a DLO that hangs, about, where nothing is known of it
-LENGTH_ERROR = 0.003  # of a length measured along a chain
-UP = np.array([0.0, 0.0, 1.0])
+RANK = {'free': 0, 'pin': 1, 'unknown': 2}  # number of unknown vectors at an end
+#: LEVI_CIVITA[i, j, k] is component k of axis i x axis j.
 LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)[None, :])
 
 
 @dataclass(frozen=True)
 class Part:
     """
-    A part of a chain on which nothing acts but its weight, its ends, and single points held by hands.
+    A part of a chain on which only its weight acts, and loads at its ends and at pinned points.
 
     :param first: index of its first point in the chain.
     :param last: index of its last point, included.
-    :param ends: what acts at either end: ``free`` nothing, ``pin`` a force, ``unknown`` a force and a moment.
+    :param ends: load at each end: ``free`` none, ``pin`` a force, ``unknown`` a force and a moment.
     :param pins: indices of points between the ends on which an unknown force acts.
     """
 
@@ -50,13 +38,13 @@ class Part:
 @dataclass(frozen=True)
 class Balance:
     """
-    What the shape of a part says.
+    The ratios of weight and stiffness that fit the shape of a part.
 
-    :param load: weight per length over bending stiffness, w / EI [1/m^3]; below 0 by noise only.
-    :param std: of `load` [1/m^3], by the noise of the points.
-    :param stretch: weight per length over stretching stiffness, w / EA [1/m]; below 0 by noise only.
-    :param stretch_std: of `stretch`; infinite where nothing pulls.
-    :param error: root mean square of a coordinate's residual [m].
+    :param load: weight per length over bending stiffness, w / EI [1/m^3]; noise can make it negative.
+    :param std: standard deviation of `load` [1/m^3].
+    :param stretch: weight per length over stretching stiffness, w / EA [1/m]; noise can make it negative.
+    :param stretch_std: standard deviation of `stretch` [1/m]; infinite where the part has no tension.
+    :param error: root mean square of the residual of a coordinate [m].
     """
 
     load: float
@@ -69,20 +57,20 @@ class Balance:
 def hanging_parts(points: Floats, level: float | None, margin: float, forces: Sequence[int],
                   pinned: Sequence[int], touching: Sequence[int] = ()) -> Iterator[Part]:
     """
-    Yield the parts of a chain at rest that hang.
+    Yield the hanging parts of a chain at rest.
 
     :param points: (n, 3) [m].
-    :param level: height [m] of the DLO's middle where it lies on the table; None: it does not.
-    :param margin: points nearer than that to the level may touch the table [m].
-    :param forces: points on which more than a force may act (those of a clamp); they end a part.
+    :param level: height of the centre line where the DLO lies on the table [m]; None: there is no table.
+    :param margin: points less than this above the level may touch the table [m].
+    :param forces: points of clamps, which apply a force and a moment; they end a part.
     :param pinned: points that are held, but free to turn.
-    :param touching: points that may touch something else; parts with such points are left out.
+    :param touching: points that may touch another part of the DLO; parts with such points are left out.
     """
     last = len(points) - 1
     hangs = np.ones(len(points), bool) if level is None else points[:, 2] > level + margin
     stops = sorted({*(int(i) for i in np.flatnonzero(~hangs)), *forces})
     for before, after in zip([-1, *stops], [*stops, last + 1], strict=True):
-        # A clamp or a touched point next to the part: the clamp itself belongs to it.
+        # A clamp at an end belongs to the part; a point on the table does not.
         first = before if before in forces else before + 1
         end = after if after in forces else after - 1
         if end - first < 2 or set(range(first, end + 1)) & set(touching):
@@ -93,66 +81,66 @@ def hanging_parts(points: Floats, level: float | None, margin: float, forces: Se
                      'free' if at == tip and at not in forces else 'unknown'
                      for at, tip in ((first, 0), (end, last)))
         if ends == ('free', 'free') and not any(first < pin < end for pin in pinned):
-            continue  # nothing holds it: it is not at rest
+            continue  # nothing holds it, so it is not at rest
         yield Part(first, end, (ends[0], ends[1]), tuple(pin for pin in sorted(pinned) if first < pin < end))
 
 
 def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance | None:
     """
-    Fit the balance of moments to a part: `EI t x t' = M`, with M by its weight and by what holds it.
+    Fit the balance of moments to a part: `EI t x t' = M`, where weight and hands cause the moment M.
 
-    Integrated twice, `r = r0 + s t0 + integral integral (M / EI) x t` is linear in w / EI
-    and in the forces and moments over EI (Antman, Nonlinear Problems of
-    Elasticity, 2nd ed., 8.3, has the balance).  So no curvature of noisy points
-    is needed.  M is taken along the points first, then along the fitted shape.
-    Where a part is long, a small error of the shape makes a large error of M far
-    away.  Then it is cut into windows that share w / EI and the forces, each
-    with its own r0, t0 and moment.
+    The balance (Antman, Nonlinear Problems of Elasticity, 2nd ed., 8.3) is integrated
+    twice: `r = r0 + s t0 + integral integral (M / EI) x t` is linear in w / EI and in
+    the forces and moments over EI, and needs no curvature of noisy points.  M is
+    computed along the observed points first, then along the fitted shape.
+    In a long part, a small error of the shape makes a large error of M far away.
+    Such a part is cut into windows, which share w / EI and the forces; each has
+    its own r0, t0 and moment.
 
     :param points: (n, 3) [m] of the whole chain.
-    :param places: (n,) [m] along the DLO.
+    :param places: (n,) arc lengths of the points [m].
     :param noise: standard deviation of a coordinate [m].
-    :returns: None where the points are too few for the unknowns.
+    :returns: None where there are too few points for the unknowns.
     """
     observed = points[part.first:part.last + 1]
     along = places[part.first:part.last + 1] - places[part.first]
     pins, ends = [pin - part.first for pin in part.pins], part.ends
-    if RANK[ends[1]] < RANK[ends[0]]:  # begin where more is known
+    if RANK[ends[1]] < RANK[ends[0]]:  # begin at the end with fewer unknowns
         observed, along, ends = observed[::-1], (along[-1] - along)[::-1], ends[::-1]
         pins = [len(observed) - 1 - pin for pin in pins][::-1]
-    most = max(1, (len(observed) - 1) // WINDOW)
+    most = max(1, (len(observed) - 1) // 7)  # a window has seven segments or more
     best: Balance | None = None
-    for windows in dict.fromkeys(min(count, most) for count in WINDOWS):
+    for windows in dict.fromkeys(min(count, most) for count in (1, 2, 4, 8)):
         found = _fitted(observed, along, ends[0], pins, windows, noise)
         if found is None:
             break
         if best is None:
             best = found
             continue
-        agrees = abs(found.load - best.load) < AGREES * math.hypot(found.std, best.std)
-        if best.error < FITS * noise and agrees:
+        agrees = abs(found.load - best.load) < 2 * math.hypot(found.std, best.std)
+        if best.error < 1.5 * noise and agrees:  # the residuals are noise
             break
-        # Errors of a shape that is too long make the load too small.
+        # The errors of the shape in a window that is too long make the load too small.
         best = found if found.std < best.std or found.load > best.load else best
     return best
 
 
 def _fitted(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
             noise: float) -> Balance | None:
-    """Return the balance of a part in windows; what is known of its last end is not used."""
-    from scipy.integrate import trapezoid  # half a second to load, which most commands need not spend
+    """Return the balance of a part in windows; knowledge about its last end is not used."""
+    from scipy.integrate import trapezoid  # takes half a second to load
 
     system = _System(along, first, pins, windows)
     freedom = sum(len(own) for own, _ in system.rows) * 3 - system.count
-    if freedom < FEWEST_ROWS:
+    if freedom < 6:
         return None
     shape = bezier_curve(along, observed, system.fine)
-    # Only a part with one free end tells its tension before its shape is fitted: what hangs below.
+    # Only below a free end is the tension known before the fit: it is the weight that hangs there.
     tension = np.array(system.fine) if system.held_at_end else np.zeros(len(shape))
-    for step in range(ITERATIONS):
+    for step in range(6):  # alternately of the shape and the moments along it
         matrix, forces = system.columns(shape, tension)
         stretch = np.zeros((1, system.count))
-        stretch[0, 1] = trapezoid(tension, system.fine) * noise / (STRAIN * along[-1])  # it is small
+        stretch[0, 1] = trapezoid(tension, system.fine) * noise / (0.05 * along[-1])  # prior: 5 % strain
         at = np.concatenate([own for own, _ in system.rows])
         right = np.concatenate([observed[at].ravel(), [0.0]])
         seen = np.concatenate([block[::system.each] for block in matrix])
@@ -167,16 +155,18 @@ def _fitted(observed: Floats, along: Floats, first: str, pins: list[int], window
         if solution[0] > 0 and not system.held_at_end:
             tension = np.linalg.norm(forces @ solution, axis=1) / solution[0]
         shape = fitted if step == 0 else (shape + fitted) / 2
-        if change < CONVERGED * noise:
+        if change < 0.02 * noise:
             break
     residual = right - rows @ solution
     error = float(np.sqrt(residual @ residual / freedom))
     inverse = np.linalg.pinv((rows / sizes).T @ (rows / sizes), rcond=1e-15) / np.outer(sizes, sizes)
-    covariance = inverse * (NOISY * max(noise, error))**2
+    # 1.7: the shape along which moments are computed is noisy too.
+    covariance = inverse * (1.7 * max(noise, error))**2
     load = float(solution[0])
     pull = float(trapezoid(tension, system.fine))
+    # The length along a chain has an error of 0.3 %.
     stretch_std = np.inf if pull <= 0 else float(np.hypot(np.sqrt(max(covariance[1, 1], 0)),
-                                                          LENGTH_ERROR * along[-1] / pull))
+                                                          0.003 * along[-1] / pull))
     return Balance(load, float(np.sqrt(covariance[0, 0])), float(solution[1]), stretch_std, error)
 
 
@@ -184,21 +174,21 @@ class _System:
     """
     The linear system of a part.
 
-    Its unknowns are w / EI and w / EA, then, over EI, the force at the first end and at each
-    pin, then for each window r0, t0 and the moment at its beginning.
+    Its unknowns are w / EI and w / EA; the forces at the first end and at each pin, over EI;
+    and for each window r0, t0 and the moment at its beginning, over EI.
 
-    :param along: (k,) [m] places of its points, from 0.
+    :param along: (k,) arc lengths of the points of the part, from 0 [m].
     """
 
     def __init__(self, along: Floats, first: str, pins: list[int], windows: int) -> None:
-        self.each = max(FEWEST_STEPS, STEPS // len(along))
+        self.each = max(3, 200 // len(along))  # integration steps per segment
         self.fine = np.append(np.concatenate([np.linspace(a, b, self.each, endpoint=False) for a, b in
                                               zip(along[:-1], along[1:], strict=True)]), along[-1])
         borders = np.linspace(0, len(along) - 1, windows + 1).round().astype(int)
-        #: of each window: its points, and its places in `fine`
+        #: for each window: the indices of its points, and its slice of `fine`
         self.rows = [(np.arange(a, b + 1), slice(a * self.each, b * self.each + 1))
                      for a, b in zip(borders[:-1], borders[1:], strict=True)]
-        # where forces act, in `fine`
+        # indices in `fine` where forces act
         self._forces = [0] * (first != 'free') + [pin * self.each for pin in pins]
         self.held_at_end = not self._forces
         self._first = 2 + 3 * len(self._forces)
@@ -207,14 +197,16 @@ class _System:
 
     def columns(self, shape: Floats, tension: Floats) -> tuple[list[Floats], Floats]:
         """
-        Return what the unknowns do to a shape under a tension per weight, (F,) [m].
+        Return the derivatives of the positions, and of the internal force, by the u unknowns.
 
-        :returns: for each window (f, 3, u) positions; (F, 3, u) internal force over EI.
+        :param shape: (F, 3) [m] along which moments are computed.
+        :param tension: (F,) tension over weight per length [m].
+        :returns: (f, 3, u) positions for each window; (F, 3, u) internal force over EI.
         """
         from scipy.integrate import cumulative_trapezoid
 
         force = np.zeros((len(self.fine), 3, self.count))
-        force[:, :, 0] = self.fine[:, None] * UP
+        force[:, 2, 0] = self.fine  # weight, upwards
         for k, pin in enumerate(self._forces):
             force[pin:, :, 2 + 3 * k:5 + 3 * k] = -np.eye(3)
         tangent = np.gradient(shape, self.fine, axis=0)
@@ -224,7 +216,7 @@ class _System:
         column = self._first
         for number, (_, own) in enumerate(self.rows):
             s = self.fine[own] - self.fine[own.start]
-            # t x N is minus the change of the moment (Kirchhoff)
+            # Kirchhoff: M' = -t x N
             moment = -cumulative_trapezoid(turn[own] @ force[own], s, axis=0, initial=0)
             if number or self._turned:
                 moment[:, :, column + 6:column + 9] = np.eye(3)

@@ -68,7 +68,8 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.mean_distance == pytest.approx(0.004)
     assert other.max_distance == pytest.approx(0.004)
     moved = [chains + (0, 0.004, 0) for chains in after.chains]
-    assert other.scores == pytest.approx([TrialScore(one[0])(one[1]) for one in zip(after.trials, moved, strict=True)])
+    assert other.scores == pytest.approx(
+        [TrialScore(trial)(chains) for trial, chains in zip(after.trials, moved, strict=True)])
     assert other.score == pytest.approx(np.mean(other.scores))
     residual = np.concatenate([residuals(*one) for one in zip(after.trials, moved, strict=True)])
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
