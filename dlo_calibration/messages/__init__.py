@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wire: messages to and from the calibrator, and the trials that they make; imports no rclpy."""
+"""Messages to and from the calibrator, and the trials made from them; imports no rclpy."""
 
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, read
 from dlo_calibration.messages.collector import TrialCollector

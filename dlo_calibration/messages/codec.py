@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages: chains and actions on the wire, to dataclasses and back; duck-typed, imports no rclpy."""
+"""Codec: ROS messages of chains and actions to dataclasses and back; duck-typed, imports no rclpy."""
 
 from __future__ import annotations
 
@@ -25,21 +25,20 @@ INPUT_TYPES: Mapping[str, str] = {
 }
 
 NANOSECONDS = 10**9  # in a second
-MAXIMUM_POINTS = 10_000  # of a chain; a whole camera image sent by mistake has more
-MAXIMUM_WAYPOINTS = 100_000  # of an action
+MAXIMUM_POINTS = 10_000  # of a chain; a camera image sent by mistake has more
+MAXIMUM_WAYPOINTS = 100_000  # of an action; a quarter of an hour at 100 Hz
 MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more
-MINIMUM_STEP = 1e-6  # s between waypoints: what seconds since a stamp of another clock still tell apart
+MINIMUM_STEP = 1e-6  # s between waypoints; seconds since 1970 as float64 resolve 0.2 us
 MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start is longer
-INT8, UINT8, FLOAT32, FLOAT64 = 1, 2, 7, 8  # sensor_msgs/PointField
-FIELD_TYPES = {INT8: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32', 6: 'uint32',
+UINT8, FLOAT32, FLOAT64 = 2, 7, 8  # datatypes of sensor_msgs/PointField
+FIELD_TYPES = {1: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32', 6: 'uint32',
                FLOAT32: 'float32', FLOAT64: 'float64'}
-CODES = {UINT8: 'u1', FLOAT32: 'f4', FLOAT64: 'f8'}
+CODES = {UINT8: 'u1', FLOAT32: 'f4', FLOAT64: 'f8'}  # of NumPy
 COORDINATES = ('x', 'y', 'z')
-ANNOTATIONS = ('hand', 'feature')
 
 
 def named(kind: str, stamp: int) -> str:
-    """Name a message as refusals do, e.g. ``goal_chain stamped 12.5 s``; `stamp` in ns."""
+    """Return the name of a message in errors, e.g. ``goal_chain stamped 12.5 s``; `stamp` in ns."""
     sign, (seconds, rest) = '-' if stamp < 0 else '', divmod(abs(stamp), NANOSECONDS)
     return f'{kind} stamped {sign}{seconds}{f".{rest:09d}".rstrip("0").rstrip(".")} s'
 
@@ -51,13 +50,13 @@ def _check_stamp(kind: str, stamp: int) -> None:
 
 
 def _check_size(thing: str, what: str, positions: Floats) -> None:
-    """Refuse finite coordinates [m] whose squares would not be; `positions` is (n, ...)."""
+    """Refuse finite but huge coordinates [m], whose squares overflow; `positions` is (n, ...)."""
     rows = positions.reshape(len(positions), positions[:1].size)
     bad = np.argwhere(np.isfinite(rows) & (np.abs(rows) > MAXIMUM_COORDINATE))
     if len(bad):
         raise InputError(thing, f'a coordinate of {rows[tuple(bad[0])]:g} m in {what} {bad[0][0]}',
                          f'at most {MAXIMUM_COORDINATE:g} m',
-                         'send metres, in the byte order that the message tells')
+                         'send metres, in the byte order that is_bigendian names')
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class ChainMessage:
 
     :param kind: INITIAL or GOAL.
     :param stamp: when it was observed [ns], > 0.
-    :param chain: its `hands` is None where the cloud has no `hand` field.
+    :param chain: its `hands` are None where the message has no field `hand`.
     """
 
     kind: str
@@ -90,11 +89,11 @@ class ChainMessage:
 @dataclass(frozen=True)
 class ActionMessage:
     """
-    What hands did.
+    The paths of the hands of an action.
 
-    :param stamp: when `times` begin to count [ns], > 0.
+    :param stamp: the instant from which `times` count [ns], > 0.
     :param names: of the h hands, 1 to 8, all different.
-    :param times: (k,) of the waypoints [s], increasing, none negative.
+    :param times: (k,) times of the waypoints [s], increasing, none negative.
     :param positions: (k, h, 3) [m].
     :param orientations: (k, h, 4) quaternions x y z w.
     """
@@ -162,7 +161,7 @@ class ActionMessage:
 
     @property
     def kind(self) -> str:
-        """Always ACTION."""
+        """The kind of message: ACTION."""
         return ACTION
 
 
@@ -172,7 +171,7 @@ def read(kind: str, message: Any) -> ChainMessage | ActionMessage:
 
     :param kind: INITIAL, ACTION or GOAL.
     :param message: an rclpy or `rosbags` object, or anything with the same attributes.
-    :raises InputError: where it cannot be used, with a text that names it.
+    :raises InputError: where the message is invalid; the text names it.
     """
     stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
     _check_stamp(kind, stamp)
@@ -223,8 +222,8 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
 
 
 def _point_type(thing: str, cloud: Any, step: int) -> np.dtype[Any]:
-    """Return the dtype of one point: the fields that matter, at their places."""
-    wanted = {**dict.fromkeys(COORDINATES, (FLOAT32, FLOAT64)), **dict.fromkeys(ANNOTATIONS, (UINT8,))}
+    """Return the dtype of one point: the fields that are used, at their offsets."""
+    wanted = {**dict.fromkeys(COORDINATES, (FLOAT32, FLOAT64)), 'hand': (UINT8,), 'feature': (UINT8,)}
     found: dict[str, tuple[str, int]] = {}
     order = '>' if cloud.is_bigendian else '<'
     for one in cloud.fields:
@@ -276,11 +275,11 @@ def _read_action(message: Any, stamp: int) -> ActionMessage:
 @dataclass(frozen=True)
 class MessageTypes:
     """
-    Where message classes come from, and what they want in two kinds of field.
+    The message classes of a library, and its values for two kinds of field.
 
-    :param find: class of a type name such as ``std_msgs/msg/Header``.
-    :param octets: value of a ``uint8[]`` field.
-    :param level: value of a ``byte`` field.
+    :param find: returns the class of a type such as ``std_msgs/msg/Header``.
+    :param octets: returns the value of a ``uint8[]`` field.
+    :param level: returns the value of a ``byte`` field.
     """
 
     find: Callable[[str], Any]
@@ -320,10 +319,10 @@ def bag_types() -> MessageTypes:
 def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str, *,
                 single: bool = False) -> Any:
     """
-    Build a PointCloud2: x y z, and `hand` and `feature` where they are annotated.
+    Build a PointCloud2 with the fields x y z, and `hand` and `feature` where they are annotated.
 
     :param stamp: [ns].
-    :param single: coordinates as float32; else float64, which loses nothing.
+    :param single: True: coordinates as float32; False: as float64, which is exact.
     """
     number = FLOAT32 if single else FLOAT64
     columns: list[tuple[str, int, NDArray[Any]]] = [

@@ -2,39 +2,37 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Collector: messages to trials, by the stamps in their headers.
+Collector: trials from messages, by the stamps in their headers.
 
-The trials follow from the collected messages alone: the same messages give the
-same trials in whatever order they arrive (topics are not ordered among each
-other, and a robot may know what its hands did only when they have done it).
+The trials depend only on the set of messages, not on the order of arrival: ROS
+does not order different topics, and a robot may publish an action only after it.
 
-- Messages are ordered by stamp; of equal stamps first the initial chain, then
-  the action, then the goal chain.
-- An initial chain begins a trial where an action or a goal chain came since the
-  last one.  Else it takes the place of that one, which gives the velocity where
-  it is less than 0.1 s older; of several older ones, the latest counts.
-- A trial's clock begins with its initial chain.  Where that is at rest, nothing
-  happens before the first hand closes, so the clock begins then (or with the
-  first goal, if that is earlier): nobody need simulate a DLO that waits.
-- A hand grips the points that the latest chain before the action annotates with
-  its number; in a goal chain, the number counts in the action before that goal,
-  and the hand is the one of that name.  Without annotation it grips the point
-  nearest to its first waypoint.
-- A goal chain stamped while a hand moves, or before any has closed, is compared
-  at that instant; otherwise with the stable configuration.
-- A goal chain stamped before the first action of its trial says nothing, and
-  waits unused: its action may be late.
+- Messages are ordered by stamp; at equal stamps, the initial chain comes first,
+  then the action, then the goal chain.
+- An initial chain begins a new trial if an action or a goal chain came since the
+  previous one.  Otherwise it replaces the previous one; from that one, if it is
+  less than 0.1 s older, the initial velocity is computed.
+- A trial's clock starts at its initial chain.  If the DLO is at rest then, the
+  clock starts when the first hand closes (or at the first goal, if that is
+  earlier), as nothing moves before.
+- A hand grips the points that carry its number in the latest chain before the
+  action.  In a goal chain, the number refers to the order of hands in the action
+  before that goal; the name of that hand identifies it.  Without annotation, the
+  hand grips the point nearest to its first waypoint.
+- A goal chain stamped while a hand moves, or before any hand has closed, is
+  compared at that instant; any other with the DLO when it has come to rest.
+- A goal chain stamped before the first action of its trial waits unused, as
+  that action may still arrive.
 
-A message that does not fit those before it is refused, and has no effect.  It is
-remembered, though, without effect: where a message arrives later that was
-stamped earlier, and it fits then, it is used.  Actions and goal chains without
-any initial chain wait (`incomplete` says so); they are refused once an initial
-chain is known that is later than they are: those that had waited, together, as
-`news`.  A message of the same kind and stamp (and of
-the same hands) as one before is refused; it replaces one that was refused.
+A message that does not fit the earlier ones is refused, but remembered: it is used
+if a message arrives later, with an earlier stamp, after which it fits.  Actions and
+goal chains before the first initial chain wait (see `incomplete`).  When an initial
+chain with a later stamp arrives, they are refused together (see `take_news`).  A
+second message of the same kind and stamp (and the same hands) is refused, unless the
+first one was refused: then it replaces that one.
 
-Of the messages that no trial uses, the latest KEPT (at least half of them) are
-remembered; what arrives later than that is refused.
+Of the messages that no trial uses, between half of KEPT and KEPT are remembered, the
+latest ones.  A message that is older than these is refused.
 """
 
 from __future__ import annotations
@@ -54,11 +52,11 @@ KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker a
 
 class TrialCollector:
     """
-    Collects messages, and gives the trials that they make.
+    Collects messages, and makes trials from them.
 
-    Not to be shared between threads.
+    It must not be shared between threads.
 
-    :param options: `grip_tolerance`, `length_tolerance` and `release` count here.
+    :param options: `grip_tolerance`, `length_tolerance` and `release` are used.
     """
 
     def __init__(self, options: Options) -> None:
@@ -66,17 +64,17 @@ class TrialCollector:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all messages, and the frame_id that they shared."""
+        """Forget all messages and their frame_id."""
         self._frame: str | None = None
         self._segments = [TrialBuilder((0, 0, ()))]
         self._known: dict[Key, Message] = {}
         self._newest: Key = (0, 0, ())
         self._spare = 0
-        self._forgotten: list[tuple[Key, Key]] = []  # from, up to but without
+        self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
         self._news: list[InputError] = []
 
     def with_options(self, options: Options) -> TrialCollector:
-        """Return a collector of the same messages, also the refused ones, that judges by other options."""
+        """Return a collector with the same messages, including refused ones, and other options."""
         other = TrialCollector(options)
         for key in sorted(self._known):
             try:
@@ -91,7 +89,7 @@ class TrialCollector:
         """
         Take one message, of any stamp.
 
-        :raises InputError: where it is refused; the trials stay as they were.
+        :raises InputError: where the message is refused; the trials do not change.
         """
         key = order(message)
         self._check(message, key)
@@ -123,7 +121,7 @@ class TrialCollector:
 
     @property
     def frame_id(self) -> str:
-        """That all messages share; empty where there was none yet."""
+        """The frame_id of all messages; empty before the first one."""
         return self._frame or ''
 
     @property
@@ -133,15 +131,15 @@ class TrialCollector:
 
     @property
     def incomplete(self) -> str:
-        """What the newest trial lacks, in words; empty where it is complete."""
+        """The messages that the newest trial lacks, in words; empty where it is complete."""
         return self._segments[-1].lacks()
 
     @property
     def problems(self) -> tuple[InputError, ...]:
         """
-        Why messages are not used, as things stand, and which trials stay incomplete.
+        The reasons why messages are unused at present, and why earlier trials are incomplete.
 
-        Also what `add` could not know when the message arrived; but not what `take_news` gives.
+        They include those that later messages caused, but not those that `take_news` returns.
         """
         found = [error for segment in self._segments for _, error in segment.refused]
         for segment, following in pairwise(self._segments[1:]):
@@ -151,24 +149,24 @@ class TrialCollector:
 
     @property
     def loose_end(self) -> tuple[InputError, ...]:
-        """Why the newest trial is none, where nothing more comes; empty where it is one, or did not begin."""
+        """The reason why the newest trial is incomplete if no more messages come, if there is one."""
         if len(self._segments) == 1:
             return self._orphans()
         return _cut_off(self._segments[-1], 'and the end', 'send all messages of a trial')
 
     def take_news(self) -> tuple[InputError, ...]:
-        """Return the refusals of messages that had waited, which the last message made certain."""
+        """Return, once, the refusals of waiting messages since the last call."""
         news, self._news = self._news, []
         return tuple(news)
 
     def _check(self, message: Message, key: Key) -> None:
-        """Refuse what can never be used; forget the refused message that `message` corrects."""
+        """Refuse a message that can never be used; forget the refused message that it replaces."""
         if self._frame is not None and message.frame_id != self._frame:
             raise InputError(
                 str(message), f'frame_id {message.frame_id!r}', f'{self._frame!r} as in the first message',
                 'send all chains and actions in one frame, or reset to begin with another')
         if any(begin <= key < end for begin, end in self._forgotten):
-            raise InputError(str(message), f'it after more than {KEPT // 2} messages that are later',
+            raise InputError(str(message), f'it after more than {KEPT // 2} later messages',
                              'messages in about the order of their stamps', 'send it earlier, or reset')
         if key not in self._known:
             return
@@ -181,14 +179,14 @@ class TrialCollector:
         self._spare -= 1
 
     def _place(self, key: Key) -> int:
-        """Return the index of the segment that a message belongs to."""
+        """Return the index of the segment to which a message belongs."""
         return bisect_right(self._segments, key, key=lambda segment: segment.first) - 1
 
     def _insert(self, message: Message, key: Key) -> InputError | None:
-        """Take a message that is earlier than another; return why it is not used, if it is not."""
+        """Take a message that is earlier than another; return the reason if it is not used."""
         begin = end = self._place(key)
         waiting, folded, found = [message], list[TrialBuilder](), None
-        # further segments change only as long as the next start is not the next trial's
+        # Further segments change only until an initial chain begins the next trial.
         while end < len(self._segments) and not (end > begin and folded[-1].busy):
             waiting = sorted([*waiting, *self._segments[end].messages()], key=order)
             if not folded:
@@ -216,7 +214,7 @@ class TrialCollector:
             'send the chain before the action begins, and stamp all messages with one clock')
 
     def _orphans(self) -> tuple[InputError, ...]:
-        """Return one refusal of all messages before the first initial chain, if there are any."""
+        """Return one refusal for all messages before the first initial chain, if there are any."""
         waiting = sorted(self._segments[0].waiting, key=order)
         return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
@@ -262,7 +260,7 @@ class TrialCollector:
             del self._known[order(message)]
 
     def _close(self, begin: Key, end: Key) -> None:
-        """Refuse, from now on, what belongs between two keys."""
+        """From now on, refuse messages with keys from `begin` up to, but not including, `end`."""
         insort(self._forgotten, (begin, end))
         merged: list[tuple[Key, Key]] = []
         for span in self._forgotten:
@@ -274,7 +272,7 @@ class TrialCollector:
 
 
 def _cut_off(segment: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:
-    """Return why a segment to which nothing more comes is no trial, if more than its start came."""
+    """Return why a finished segment is no trial, if it has more than initial chains."""
     if segment.complete or not (segment.moves or segment.waiting):
         return ()
     if segment.moves:

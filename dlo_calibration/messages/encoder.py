@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trial messages: the messages that a robot would have sent, had it done given trials."""
+"""Encoder: the messages that a robot sends when it does given trials."""
 
 from __future__ import annotations
 
@@ -16,25 +16,23 @@ from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
 
-EPOCH = 1_700_000_000 * NANOSECONDS  # of the first trial
-PAUSE = 10 * NANOSECONDS  # between two trials
-BEFORE = NANOSECONDS // 100  # an earlier chain that gives a velocity is that much older
+BEFORE = NANOSECONDS // 100  # from the chain that gives a velocity to the initial chain
 
 
 def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Union[ChainMessage, ActionMessage]]:
     """
-    Return messages that a `TrialCollector` makes the same trials of, to a nanosecond.
+    Return messages from which a `TrialCollector` makes the same trials, to a nanosecond.
 
-    A hand that goes on holding during a later action takes part in it, at rest.
-    What the wire cannot say is lost: two hands that grip one point of a chain, and
-    a hand that closes far from where the latest chain before it shows its point.
+    A hand that keeps holding the DLO during a later action takes part in it, at rest.
+    Two cases cannot be sent, and are lost: two hands that grip one point of a chain, and
+    a hand that closes far from its point in the latest chain before the action.
     """
     found: list[Union[ChainMessage, ActionMessage]] = []
-    zero = EPOCH
+    zero = 1_700_000_000 * NANOSECONDS  # a time in 2023, as real stamps are
     for trial in trials:
         found += _messages(trial, frame_id, zero)
         end = max([goal.time for goal in trial.goals] + [hand.end for hand in trial.hands])
-        zero += round(end * NANOSECONDS) + PAUSE
+        zero += round(end * NANOSECONDS) + 10 * NANOSECONDS
     return found
 
 
@@ -64,7 +62,7 @@ def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage
 
 
 def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
-    """Return the hands that close and open together, in the order of their closing."""
+    """Return groups of hands that close and open together, in the order of their closing."""
     groups: dict[tuple[int, float, float], list[Hand]] = {}
     for k, action in enumerate(trial.actions):
         for hand in action.hands:
@@ -80,7 +78,7 @@ def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
 
 
 def _at_rest(hand: Hand, start: float, end: float) -> Hand:
-    """Return a hand that stays where another one has arrived."""
+    """Return the path of a hand that stays at the last pose of `hand`."""
     times = [start, end] if end > start else [start]
     return Hand(hand.name, hand.grips, np.array(times), np.repeat(hand.positions[-1:], len(times), axis=0),
                 np.repeat(hand.orientations[-1:], len(times), axis=0))
@@ -92,7 +90,7 @@ def _seen(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain
 
 
 def _annotated(chain: Chain, hands: Sequence[Hand], holding: Sequence[str]) -> Chain:
-    """Return the chain with the number of the hand at each gripped point."""
+    """Return the chain with the number of the holding hand at each gripped point."""
     numbers = np.zeros(len(chain), np.uint8)
     for k, hand in enumerate(hands, start=1):
         if hand.name in holding:
@@ -101,7 +99,7 @@ def _annotated(chain: Chain, hands: Sequence[Hand], holding: Sequence[str]) -> C
 
 
 def _poses(hand: Hand, times: Floats) -> tuple[Floats, Floats]:
-    """Return (k, 3) positions [m] and (k, 4) quaternions of a hand."""
+    """Return (k, 3) positions [m] and (k, 4) quaternions of a hand at (k,) times [s]."""
     if len(hand.times) == len(times):
         return hand.positions, hand.orientations
     from scipy.spatial.transform import Rotation, Slerp  # slow to load

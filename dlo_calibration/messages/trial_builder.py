@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""TrialBuilder: the messages from one start to the next, of which a trial is made."""
+"""TrialBuilder: the messages of one trial, from its initial chain to the next one."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ from dlo_calibration.model.trial import Goal, Trial
 Message = Union[ChainMessage, ActionMessage]
 Key = tuple[int, int, tuple[str, ...]]
 
-VELOCITY_WINDOW = NANOSECONDS // 10  # an initial chain at least that much older gives no velocity
-RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}
+RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}  # order of messages with equal stamps
 
 
 def order(message: Message) -> Key:
-    """Return what messages are sorted by; no two collected ones have the same."""
+    """Return the key by which messages are sorted; it is unique among collected messages."""
     names = message.names if isinstance(message, ActionMessage) else ()
     return message.stamp, RANKS[message.kind], names
 
 
 @dataclass(frozen=True)
 class Move:
-    """An action that can be used: which points each of its hands grips, and when it moves [ns]."""
+    """A usable action: the points that each hand grips, and the instants of its waypoints [ns]."""
 
     message: ActionMessage
     grips: tuple[tuple[int, ...], ...]
@@ -41,7 +40,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Sight:
-    """A goal chain that can be used; its annotation numbers the hands of `names`."""
+    """A usable goal chain; its annotation numbers the hands in `names`."""
 
     message: ChainMessage
     names: tuple[str, ...]
@@ -52,10 +51,14 @@ class Sight:
 @dataclass
 class TrialBuilder:
     """
-    Messages from one start to the next: a trial, complete or not.
+    A segment: the messages of one trial, complete or not.
 
-    The first segment of a collector has no start: it holds what came before any.
-    `extend` takes messages in order only.
+    The first segment of a collector has no initial chain: it holds the messages before the first one.
+    `extend` takes messages in their order only.
+
+    :param first: key of the first initial chain.
+    :param starts: initial chains; the last one counts, and the one before it for the velocity.
+    :param waiting: messages for which an initial chain or an action is still missing.
     """
 
     first: Key
@@ -68,12 +71,12 @@ class TrialBuilder:
 
     @property
     def busy(self) -> bool:
-        """Tell whether an initial chain that comes now begins the next trial."""
+        """Tell whether the next initial chain begins a new trial."""
         return bool(self.moves or self.sights or self.waiting or not self.starts)
 
     @property
     def complete(self) -> bool:
-        """Tell whether it is a trial."""
+        """Tell whether the messages make a trial."""
         return bool(self.moves and self.sights)
 
     @property
@@ -84,12 +87,12 @@ class TrialBuilder:
         return max(len(self.starts) - 2, 0) + len(self.waiting) + len(self.refused)
 
     def messages(self) -> list[Message]:
-        """Return all its messages, sorted."""
+        """Return all messages of the segment, in order."""
         return sorted([*self.starts, *(m.message for m in self.moves), *(s.message for s in self.sights),
                        *self.waiting, *(message for message, _ in self.refused)], key=order)
 
     def extend(self, message: Message, options: Options) -> InputError | None:
-        """Take a message that is later than all others; return why it is not used, if it is not."""
+        """Take a message that is later than all others; return the reason if it is refused."""
         try:
             if message.kind == INITIAL:
                 self.starts.append(message)  # type: ignore[arg-type]
@@ -164,7 +167,7 @@ class TrialBuilder:
         return Sight(goal, latest.names, bool(finished) and not under_way, held_by)
 
     def build(self, name: str) -> Trial:
-        """Return the trial of a complete segment; the same object as long as it is the same."""
+        """Return the trial of a complete segment; the same object until a message changes it."""
         if self.trial is None:
             self.trial = self._build(name)
         elif self.trial.name != name:
@@ -190,12 +193,12 @@ class TrialBuilder:
             return None
         earlier, start = self.starts[-2:]
         elapsed = start.stamp - earlier.stamp
-        if elapsed >= VELOCITY_WINDOW or len(earlier.chain) != len(start.chain):
+        if elapsed >= NANOSECONDS // 10 or len(earlier.chain) != len(start.chain):
             return None
         return (start.chain.points - earlier.chain.points) * (NANOSECONDS / elapsed)
 
     def lacks(self) -> str:
-        """Say in words what it takes to complete it; empty where it is complete."""
+        """Return, in words, the messages that are missing; empty where the trial is complete."""
         if self.complete:
             return ''
         if not self.starts:

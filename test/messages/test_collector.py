@@ -443,7 +443,7 @@ def test_hour_of_initial_chains_is_one_start(monkeypatch):
     for k in range(2000):
         collector.add(replace(first, stamp=first.stamp + k * 33_000_000))
     text = refused(collector, action(10))
-    assert 'after more than 50 messages that are later' in text
+    assert 'after more than 50 later messages' in text
     collector.add(action(66))
     collector.add(goal(70))
     assert collector.trials[0].velocity is not None
@@ -459,7 +459,7 @@ def test_what_trials_use_is_never_forgotten(monkeypatch):
     collector.add(action(320))
     collector.add(goal(330))
     assert [len(t.goals) for t in collector.trials] == [100, 1]
-    assert 'messages that are later' in refused(collector, action(150))
+    assert 'later messages' in refused(collector, action(150))
 
 
 def test_refusals_do_not_pile_up(monkeypatch):
