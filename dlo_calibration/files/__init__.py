@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is written and read: sessions, requests, results."""
+"""Files that are written and read: sessions, requests, results."""
 
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import read_request, write_request

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A recording: the messages in an MCAP file, a rosbag2 folder or a .db3 file, however damaged."""
+"""Bag: reads the messages of an MCAP file, a rosbag2 folder or a .db3 file, even if it is damaged."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Record:
     """
     One recorded message.
 
-    :param type: in full, ``package/msg/Type``.
+    :param type: full name, ``package/msg/Type``.
     :param data: CDR bytes, with the encapsulation header.
-    :param log_time: when it was recorded [ns].
+    :param log_time: time of the recording [ns].
     """
 
     topic: str
@@ -54,7 +54,7 @@ def decode(record: Record) -> Any:
     """
     try:
         return typestore().deserialize_cdr(record.data, record.type)
-    except Exception as error:  # whatever the decoder meets in damaged bytes
+    except Exception as error:  # damaged bytes can raise anything
         raise InputError(
             f'{record.name} recorded at {record.log_time / 1e9:.3f} s',
             f'bytes that do not decode ({error!r})', f'a {record.type}',
@@ -67,7 +67,7 @@ def encode(message: Any, message_type: str) -> bytes:
 
 
 class _WholeReads:
-    """A stream that ends rather than give less than was asked for."""
+    """A stream that raises an error instead of returning fewer bytes than requested."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -81,14 +81,14 @@ class _WholeReads:
 
 
 class Bag:
-    """What was read so far of a recording, from one or more files."""
+    """The parts of a recording that were read so far, from one or more files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.records: list[Record] = []
         self.options: dict[str, Any] | None = None
         self.problems: list[str] = []
-        self.marks: list[tuple[str, int]] = []  # each with the number of records before it
+        self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
 
     def unusable(self, came: str, expected: str, remedy: str) -> InputError:
         """Return the error for a source that cannot be read at all."""
@@ -96,9 +96,9 @@ class Bag:
 
     def used(self, inputs: Iterable[Record]) -> list[Record]:
         """
-        Return those that the last calibration stood on, or all where none was started.
+        Return the inputs that the last calibration used, or all where none was started.
 
-        What came before a reset does not count, unless nothing came after it.
+        Inputs before a reset are left out, unless none came after it.
         """
         inputs = list(inputs)
         places = {id(record): place for place, record in enumerate(self.records)}
@@ -132,7 +132,7 @@ class Bag:
                                 'copy the recording with all of its files')
 
     def _about_folder(self) -> Mapping[str, Any]:
-        """Return what metadata.yaml says; nothing where there is none, or it is damaged."""
+        """Return the content of metadata.yaml; empty where the file is missing or damaged."""
         file = self.path / METADATA_FILE
         if not file.exists():
             self.problems.append(f'{METADATA_FILE} is missing')
@@ -143,25 +143,25 @@ class Bag:
                 return about
         except OSError:
             raise
-        except Exception:  # YAML that is damaged anywhere
+        except Exception:  # damaged YAML can raise anything
             pass
         self.problems.append(f'{METADATA_FILE} cannot be read; the files in the folder are taken as they are')
         return {}
 
     def read_rosbags(self, path: Path) -> None:
-        """Read with the library rosbags: SQLite files and compressed folders."""
-        from rosbags.rosbag2 import Reader  # brings compression libraries that MCAP does not need
+        """Read a SQLite file or a compressed folder with the library rosbags."""
+        from rosbags.rosbag2 import Reader  # loads compression libraries that MCAP does not need
 
         before = len(self.records)
         try:
             with Reader(path) as reader:
                 for connection, log_time, data in reader.messages():
                     self.records.append(Record(connection.topic, connection.msgtype, bytes(data), log_time))
-        except Exception as error:  # of any kind: it reads files that are damaged anywhere
+        except Exception as error:  # damaged files can raise anything
             self._ended(path, before, error)
 
     def read_mcap(self, path: Path) -> None:
-        """Read an MCAP file up to its end, or up to where it is cut or damaged."""
+        """Read an MCAP file to its end, or to the first damaged place."""
         before = len(self.records)
         with path.open('rb') as stream:
             try:
@@ -172,7 +172,7 @@ class Bag:
                         self.problems.append(entry)
                     else:
                         self._read_ours(entry)
-            except Exception as error:  # of any kind: it reads files that are damaged anywhere
+            except Exception as error:  # damaged files can raise anything
                 self._ended(path, before, error)
 
     def _read_ours(self, entries: Mapping[str, str]) -> None:
@@ -201,7 +201,7 @@ class Bag:
         return usable
 
     def _ended(self, path: Path, before: int, error: Exception) -> None:
-        """Note where reading ended; nothing read at all is an error."""
+        """Note an early end of reading; raise an error where nothing was read."""
         why = 'the file ends too early' if isinstance(error, EndOfFile) else \
             ' '.join(f'{type(error).__name__}: {error}'.split())
         if len(self.records) == before:
@@ -212,7 +212,7 @@ class Bag:
 
 
 def _mcap_entries(stream: BinaryIO, size: int) -> Iterator[Record | Mapping[str, str] | str]:
-    """Yield the messages, our own metadata records, and texts about what is left out."""
+    """Yield the messages, our own metadata records, and a text for each thing that is left out."""
     reader = StreamReader(_WholeReads(stream), validate_crcs=True, record_size_limit=size)  # type: ignore
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -237,6 +237,6 @@ def _mcap_entries(stream: BinaryIO, size: int) -> Iterator[Record | Mapping[str,
 
 
 def _full_name(name: str) -> str:
-    """Return ``package/msg/Type`` of the short name that some writers use."""
+    """Return ``package/msg/Type``, also for the short form ``package/Type`` of some writers."""
     package, slash, kind = name.partition('/')
     return f'{package}/msg/{kind}' if slash and '/' not in kind else name

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Evaluations: everything that a calibration tried, as a CSV file."""
+"""Evaluations: all evaluations of a calibration as a CSV file."""
 
 from __future__ import annotations
 

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Recording: a session is written into a new rosbag2 folder as it happens.
+Recording: writes a session into a new rosbag2 folder while it takes place.
 
-One MCAP file as `ros2 bag record` writes it (profile ``ros2``, schema encoding
-``ros2msg``, CDR bytes), with a ``metadata.yaml`` beside it, so `ros2 bag play`,
-Foxglove and the library rosbags read it.
+The folder has one MCAP file in the form of `ros2 bag record` (profile ``ros2``,
+schema encoding ``ros2msg``, CDR bytes) and a ``metadata.yaml``.  `ros2 bag play`,
+Foxglove and the library rosbags can read it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,13 @@ from ruamel.yaml import YAML
 from dlo_calibration.errors import DloCalibrationError
 
 OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
-METADATA_FILE = 'metadata.yaml'
+METADATA_FILE = 'metadata.yaml'  # name and key are rosbag2's
 METADATA_KEY = 'rosbag2_bagfile_information'
-ROSBAG2_VERSION = 9  # of metadata.yaml: what Jazzy writes, and the last that rosbags reads
-NO_TIME = 2**63 - 1  # rosbag2's starting time of a bag without messages
-FOREVER = {'sec': 9223372036, 'nsec': 854775807}  # rmw's infinite duration
-LATCHED = ('result', 'status', 'dlo_description', 'markers')  # topics whose last message stays
+LATCHED = ('result', 'status', 'dlo_description', 'markers')  # topics that also send late subscribers the last one
 
 
 class RecordingError(DloCalibrationError):
-    """A session that cannot be written further (disk full, no permission, ...)."""
+    """A session can no longer be written (disk full, no permission, ...)."""
 
 
 @lru_cache(maxsize=1)
@@ -47,14 +44,14 @@ class SessionWriter:
     """
     Writes a session into a new rosbag2 folder.
 
-    Nothing is ever overwritten: where `path` exists, the folder is called
-    ``path_2``, ``path_3``, ...  Each message is on its way to the disk when
-    `write` returns, so a killed process loses none that it had written.
+    No file is overwritten: where `path` exists, the folder is called ``path_2``,
+    ``path_3``, ...  Each message is given to the operating system before `write`
+    returns, so a killed process loses no message that it has written.
 
-    :param path: the folder to make, or, ending in ``.mcap``, a single file
-        without folder and metadata.yaml; parents are made too.
+    :param path: the folder to create, or, if it ends in ``.mcap``, a single file
+        without folder and metadata.yaml; parent folders are created too.
     :param options: as for `write_options`; None: written later or never.
-    :raises RecordingError: here and in every method, where the disk refuses.
+    :raises RecordingError: here and in every method, where writing fails.
         Nothing is written after the first such error.
     """
 
@@ -63,7 +60,7 @@ class SessionWriter:
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[tuple[str, str], int] = {}
-        self._first, self._last = NO_TIME, 0
+        self._first, self._last = 2**63 - 1, 0  # rosbag2's starting time of a bag without messages
         self._closed = False
         try:
             self.path, self.file, self._stream = _create(Path(path))
@@ -85,8 +82,8 @@ class SessionWriter:
         :param message_type: ``package/msg/Type``, one of Jazzy's common_interfaces.
         :param data: CDR bytes.
         :param log_time: [ns], greater than 0.
-        :param flush: False where more messages of the same group follow at once;
-            the group then costs less space, and reaches the disk with its last.
+        :param flush: False where more messages follow at once; such a group takes less
+            space, and is written with its last message.
         """
         key = topic, message_type
         with self._disk():
@@ -102,15 +99,15 @@ class SessionWriter:
                 self._write_metadata_file()
 
     def write_options(self, options: Mapping[str, Any]) -> None:
-        """Record the options in force, a flat mapping, so that a replay uses the same."""
+        """Record the current options, by name, so that a replay uses the same ones."""
         self._write_ours('options', json.dumps(dict(options), sort_keys=True))
 
     def write_mark(self, mark: str) -> None:
         """
-        Record that a calibration of what was collected began, or that the trials were forgotten.
+        Record the start of a calibration, or a reset, which forgets the trials.
 
-        :param mark: ``start`` or ``reset``, the services that change which
-            messages a result stands on.
+        :param mark: ``start`` or ``reset``, the services that decide which
+            messages a result uses.
         """
         self._write_ours('mark', mark)
 
@@ -146,7 +143,7 @@ class SessionWriter:
         try:
             self._stream.close()
         except OSError:
-            pass  # it was reported by what failed first
+            pass  # the first error is the one to report
         return RecordingError(self._failure)
 
     def _write_ours(self, key: str, text: str) -> None:
@@ -167,13 +164,14 @@ class SessionWriter:
         self._counts[topic, message_type] = 0
 
     def _metadata(self) -> dict[str, Any]:
-        """Describe the bag as rosbag2_storage's struct BagMetadata, version 9, does."""
+        """Return the metadata in the form of rosbag2_storage's struct BagMetadata, version 9."""
+        # Jazzy writes version 9, and rosbags reads none above it.
         count = sum(self._counts.values())
         times: dict[str, Any] = {
             'duration': {'nanoseconds': self._last - self._first if count else 0},
             'starting_time': {'nanoseconds_since_epoch': self._first}}
         return {
-            'version': ROSBAG2_VERSION, 'storage_identifier': 'mcap', **times, 'message_count': count,
+            'version': 9, 'storage_identifier': 'mcap', **times, 'message_count': count,
             'topics_with_message_count': [
                 {'topic_metadata': {
                     'name': topic, 'type': message_type, 'serialization_format': 'cdr',
@@ -187,7 +185,7 @@ class SessionWriter:
             'custom_data': {}, 'ros_distro': 'jazzy'}
 
     def _write_metadata_file(self) -> None:
-        """Write metadata.yaml, whole or not at all."""
+        """Replace metadata.yaml at once, so that it is never incomplete."""
         if self.file == self.path:
             return
         whole = self.path / f'{METADATA_FILE}.new'
@@ -196,7 +194,7 @@ class SessionWriter:
 
 
 class _Disk:
-    """Turns an error of the disk into the writer's one exception."""
+    """A context that turns errors of the disk into RecordingError."""
 
     def __init__(self, writer: SessionWriter) -> None:
         self._writer = writer
@@ -210,7 +208,7 @@ class _Disk:
 
 
 def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
-    """Create what is asked for under a name that is not taken; return it, its MCAP file, and that open."""
+    """Create the folder or file under a free name; return its path, its MCAP file, and that file open."""
     for number in range(1, 100000):
         suffix = path.suffix if path.suffix == '.mcap' else ''
         free = path if number == 1 else path.with_name(f'{path.name.removesuffix(suffix)}_{number}{suffix}')
@@ -227,11 +225,12 @@ def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
 
 
 def _qos(topic: str) -> dict[str, Any]:
+    forever = {'sec': 9223372036, 'nsec': 854775807}  # rmw's infinite duration
     latched = topic.rsplit('/', 1)[-1] in LATCHED
     return {'history': 'keep_last', 'depth': 1 if latched else 10, 'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',
-            'deadline': dict(FOREVER), 'lifespan': dict(FOREVER), 'liveliness': 'automatic',
-            'liveliness_lease_duration': dict(FOREVER), 'avoid_ros_namespace_conventions': False}
+            'deadline': forever, 'lifespan': forever, 'liveliness': 'automatic',
+            'liveliness_lease_duration': forever, 'avoid_ros_namespace_conventions': False}
 
 
 def _yaml(value: Any) -> str:

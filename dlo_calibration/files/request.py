@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Request: what to calibrate as an XML document: the object, the settings, the trials.
+Request: an XML document with the object, the settings and the trials of a calibration.
 
-A trial's actions are named ones, or explicit paths of hands.  A named action is
-done on the latest observed chain before it: the initial one, or a goal chain.
+The actions of a trial are named actions, or explicit paths of hands.  A named action
+starts from the latest observed chain before it: the initial one, or a goal chain.
 """
 
 from __future__ import annotations
@@ -42,12 +42,9 @@ from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
 from dlo_calibration.model.trial import Goal, Trial
 
-ROOT = 'calibration_request'
-WHAT = 'request'
-PATHS = 'hand_paths'
-TURNS = ('qx', 'qy', 'qz', 'qw')
-LAST = ('start', 'hold')  # attributes of a named action that come after the others
-HAND_NAME = re.compile(r'[^\s\x00-\x1f\ud800-\udfff\ufffe\uffff]{1,100}')
+WHAT = 'request'  # in errors
+PATHS = 'hand_paths'  # element of explicit paths
+TURNS = ('qx', 'qy', 'qz', 'qw')  # attributes of a waypoint
 
 
 @dataclass(frozen=True)
@@ -56,8 +53,8 @@ class GoalRequest:
     A goal chain of a request.
 
     :param time: seconds since the start of the trial.
-    :param stable: compared when the simulated DLO has come to rest, else at that instant.
-    :param held_by: names of the hands that hold it; None: as the actions before it say.
+    :param stable: True: compared when the simulated DLO has come to rest; False: at that instant.
+    :param held_by: names of the hands that hold the DLO; None: those that still hold it after the actions.
     """
 
     chain: Chain
@@ -71,7 +68,7 @@ class TrialRequest:
     """
     A trial of a request.
 
-    :param actions: named ones, or what hands did.
+    :param actions: named actions, or explicit paths of hands.
     :param velocity: (n, 3) [m/s] of the initial points; None: at rest.
     """
 
@@ -87,24 +84,25 @@ class TrialRequest:
         names = {name for action in self.actions for name in _hand_names(action)}
         names.update(name for goal in self.goals for name in goal.held_by or ())
         for name in names:
-            if not HAND_NAME.fullmatch(name):
+            # XML attributes can hold these characters, and a list of names has blanks between them.
+            if not re.fullmatch(r'[^\s\x00-\x1f\ud800-\udfff\ufffe\uffff]{1,100}', name):
                 raise InputError(f'trial {self.name!r}', f'a hand named {name!r}',
                                  'at most 100 characters without blanks', 'choose another name')
         self.trial()
 
     @classmethod
     def of(cls, trial: Trial) -> TrialRequest:
-        """Return the request of a trial as it was observed."""
+        """Return the request for an observed trial."""
         goals = tuple(GoalRequest(one.chain, one.time, one.stable, one.held_by) for one in trial.goals)
         return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
 
     def trial(self, release: bool = True) -> Trial:
         """
-        Return the trial, in which all actions are what hands did.
+        Return the trial, in which all actions are explicit paths of hands.
 
-        :param release: hands that follow explicit paths open at their last waypoint, where
-            a goal does not say who holds it.
-        :raises InputError: where an action cannot be done.
+        :param release: True: hands on explicit paths open at their last waypoint, unless
+            a goal names them in `held_by`.
+        :raises InputError: where an action is impossible.
         """
         done: list[Action] = []
         holds: list[tuple[float, tuple[str, ...], bool]] = []
@@ -130,10 +128,10 @@ class TrialRequest:
 @dataclass(frozen=True)
 class Request:
     """
-    What to calibrate.
+    The object, settings and trials of a calibration.
 
-    :param options: those given, by name; with the mass, if it is known [kg].
-    :param name: of the object.
+    :param options: the given options, by name, including the mass [kg] if it is known.
+    :param name: name of the object.
     """
 
     trials: tuple[TrialRequest, ...]
@@ -150,7 +148,7 @@ class Request:
     @cached_property
     def document(self) -> bytes:
         """The request as an XML document in UTF-8."""
-        root = new_root(ROOT)
+        root = new_root('calibration_request')
         settings = {name: value for name, value in self.options.items() if name != 'mass'}
         add(root, 'object', name=self.name, mass=self.options.get('mass'))
         add_options(root, 'settings', settings)
@@ -182,7 +180,7 @@ def read_request(path: str | Path) -> Request:
     """
     Read a request file.
 
-    :raises InputError: where it cannot be read, or is not such a document;
+    :raises InputError: where the file cannot be read, or is not a valid request;
         the text names the line and the element.
     """
     return request_of(read_octets(path, WHAT, 'a calibration request'), f'{WHAT} {path}')
@@ -190,12 +188,12 @@ def read_request(path: str | Path) -> Request:
 
 def request_of(octets: bytes, where: str = WHAT) -> Request:
     """
-    Read a document.
+    Read a request from the bytes of its document.
 
-    :param where: names it in refusals.
-    :raises InputError: where it is not such a document.
+    :param where: name of the document in errors.
+    :raises InputError: where it is not a valid request.
     """
-    root = parse(octets, where, ROOT)
+    root = parse(octets, where, 'calibration_request')
     of_object, settings, *trials = root
     options = read_options(where, settings)
     if 'mass' in options:
@@ -214,9 +212,9 @@ def request_of(octets: bytes, where: str = WHAT) -> Request:
 
 def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
     """
-    Return the trials of a request, and why some of it is not used.
+    Return the trials of a request, and the reasons why others are not used.
 
-    :param options: `length_tolerance` and `release` count here.
+    :param options: `length_tolerance` and `release` are used.
     """
     trials, refusals = [], []
     for one in request.trials:
@@ -241,8 +239,9 @@ def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:
 
 def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
     if isinstance(action, NamedAction):
-        values = {one.name: getattr(action, one.name) for one in fields(action) if one.name not in LAST}
-        add(parent, action.name, **values, **{name: getattr(action, name) for name in LAST})
+        values = {one.name: getattr(action, one.name) for one in fields(action)}
+        last = {name: values.pop(name) for name in ('start', 'hold')}  # their place in the schema
+        add(parent, action.name, **values, **last)
         return
     paths = add(parent, PATHS)
     for hand in action.hands:
@@ -255,7 +254,7 @@ def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
 
 
 def _placed(where: str, element: Any, error: InputError) -> InputError:
-    """Return an error with its place in the file."""
+    """Return an error that names its place in the file."""
     if error.thing.startswith(where):
         return error
     return refused(where, element, f'{error.thing}: {error.came}', error.expected, error.remedy)
@@ -307,7 +306,7 @@ def _hand(where: str, element: Any) -> Hand:
 
 
 def _value(where: str, element: Any, name: str, kind: str) -> Any:
-    """Return an attribute of a named action, as the type of the field of its dataclass says."""
+    """Return an attribute of a named action in `kind`, the type of its field in the dataclass."""
     text = element.get(name)
     if kind == 'bool':
         return text == 'true'

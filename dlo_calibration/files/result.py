@@ -4,8 +4,8 @@
 """
 Description: the definition of a DLO as an XML document.
 
-Its point chain with annotations, its parameters with units and intervals, its
-mass, and how they were found.  The node publishes it, and result.xml holds it.
+It contains the chain with annotations, the parameters with units and intervals, the
+mass, and the calibration that found them.  The node publishes it, and result.xml holds it.
 """
 
 from __future__ import annotations
@@ -39,30 +39,25 @@ from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
 
-ROOT = 'dlo'
-WHAT = 'result file'
+WHAT = 'result file'  # in errors
 #: Attributes of the calibration, in the order of the document.
 HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason')
-TOLERANCE = 1e-3  # relative, of a physical value that somebody rounded
-
-ESTIMATE_NUMBERS = ('value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')
-ERROR_NUMBERS = tuple(one.name for one in fields(PointErrors))
 
 
 @dataclass(frozen=True)
 class Description:
     """
-    What the definition of a DLO says.
+    The definition of a DLO.
 
-    :param parameters: the found ones, in the order of the calibration.
-    :param fixed: values of others on the 0..100 scale; those not named keep their default.
-    :param mass: kg of the whole DLO; 0 where it was not known.
+    :param parameters: the found parameters, in the order of the calibration.
+    :param fixed: values of others on the 0..100 scale; the rest keep their defaults.
+    :param mass: of the whole DLO [kg]; 0: unknown.
     :param length: mean length of the DLO over the trials [m].
     :param chain: the DLO at rest, before the first trial's action, with its annotations.
-    :param options: those in force, by name; empty where they were not given.
+    :param options: options of the calibration, by name; empty where they were not given.
     :param trials: names of the trials.
-    :param scores: difference score of each trial.
-    :param confirmation: what a second engine gave for the same parameters; None: none was asked.
+    :param scores: difference score of each trial [cm].
+    :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
     """
 
     parameters: Mapping[str, ParameterEstimate]
@@ -109,11 +104,11 @@ class Description:
 
     @property
     def space(self) -> ParameterSpace:
-        """The parameters that were found, and where the others stayed."""
+        """The found parameters, and the values of the others."""
         return ParameterSpace(tuple(self.parameters), self.fixed, self.mass)
 
     def physical(self) -> dict[str, float]:
-        """Every parameter's physical value in SI units, exactly as they were in the best evaluation."""
+        """Return the physical value of every parameter, in SI units, exactly as in the best evaluation."""
         return self.space.physical(self.values, self.length)
 
 
@@ -122,7 +117,7 @@ def description_document(found: CalibrationResult | Description,
     """Return the definition of a DLO as an XML document in UTF-8."""
     dlo = found if isinstance(found, Description) else Description.of(found, options)
     space = dlo.space
-    root = new_root(ROOT)
+    root = new_root('dlo')
     root.set('mass', text_of(dlo.mass))
     root.set('length', text_of(dlo.length))
     add_chain(root, 'chain', dlo.chain)
@@ -149,7 +144,7 @@ def description_document(found: CalibrationResult | Description,
 def write_result(path: str | Path, result: CalibrationResult | Description,
                  options: Mapping[str, Any] | None = None) -> None:
     """
-    Write a result, and the options in force, to an XML file.
+    Write a result, and the options of its calibration, to an XML file.
 
     :raises InputError: where the file cannot be written.
     """
@@ -160,7 +155,7 @@ def read_result(path: str | Path) -> Description:
     """
     Read a result file.
 
-    :raises InputError: where it cannot be read, or is not such a document;
+    :raises InputError: where the file cannot be read, or is not a valid result;
         the text names the line and the element.
     """
     return read_description(read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}')
@@ -168,14 +163,14 @@ def read_result(path: str | Path) -> Description:
 
 def read_description(octets: bytes | str, where: str = 'dlo_description') -> Description:
     """
-    Read a document, e.g. the text of the message `dlo_description`.
+    Read the definition of a DLO from its document, e.g. the text of the message `dlo_description`.
 
-    :param where: names it in refusals.
-    :raises InputError: where it is not such a document.
+    :param where: name of the document in errors.
+    :raises InputError: where it is not a valid definition.
     """
     if isinstance(octets, str):
         octets = octets.encode('utf-8', 'surrogatepass')
-    root = parse(octets, where, ROOT)
+    root = parse(octets, where, 'dlo')
     chain, parameters, calibration = root
     fit, *second, options, warnings = calibration
     seed = calibration.get('seed')
@@ -208,7 +203,7 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
 
 
 def _add_fit(calibration: Any, tag: str, found: Description | Confirmation, trials: Sequence[str]) -> None:
-    """Add how well it fits, in all and by trial: with one engine, or with a second one that confirms it."""
+    """Add the score and errors of all trials, and the score of each, by the first or a second engine."""
     other = vars(found) if isinstance(found, Confirmation) else {}
     element = add(calibration, tag, engine=other.get('engine'), score=found.score, **asdict(found.errors),
                   mean_distance=other.get('mean_distance'), max_distance=other.get('max_distance'))
@@ -225,14 +220,15 @@ def _confirmation(where: str, element: Any) -> Confirmation:
 
 
 def _errors(where: str, element: Any) -> PointErrors:
-    return PointErrors(**{name: number(where, element, name) for name in ERROR_NUMBERS})
+    return PointErrors(**{one.name: number(where, element, one.name) for one in fields(PointErrors)})
 
 
 def _estimates(where: str, parameters: Any) -> dict[str, ParameterEstimate]:
     found: dict[str, ParameterEstimate] = {}
     for element in parameters.findall('found'):
         name = element.get('name')
-        numbers = {one: number(where, element, one) for one in ESTIMATE_NUMBERS}
+        numbers = {one: number(where, element, one) for one in (
+            'value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')}
         if name in found:
             raise refused(where, element, f'the name {name!r} twice', 'each name once')
         if not 0 <= numbers['value'] <= SCALE:
@@ -259,9 +255,9 @@ def _fixed(where: str, parameters: Any) -> dict[str, float]:
 
 
 def _check_physical(where: str, element: Any, space: ParameterSpace) -> None:
-    """Refuse a value that was changed in one of its units only."""
+    """Refuse a value and a physical value that differ by more than rounding."""
     physical, unit = space.reported(element.get('name'), number(where, element, 'value'))
     given = number(where, element, 'physical_value')
-    if not math.isclose(given, physical, rel_tol=TOLERANCE) or element.get('physical_unit') != unit:
+    if not math.isclose(given, physical, rel_tol=1e-3) or element.get('physical_unit') != unit:
         raise refused(where, element, f'{given:g} {element.get("physical_unit")}, which is not what '
                       f'{element.get("value")} is', f'{physical:g} {unit}', 'change both')

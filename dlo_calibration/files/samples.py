@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples: where the sessions that ship with the package are."""
+"""Samples: the folder of the sessions that ship with the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dlo_calibration.errors import InputError
 
 
 def samples() -> Path:
-    """Return the folder of the sample sessions: of the sources, or where they are installed."""
+    """Return the folder of the sample sessions, in the sources or where they are installed."""
     beside = Path(__file__).resolve().parents[2] / 'msg_samples'
     shared = Path('share') / 'dlo_calibration' / 'msg_samples'
     prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Session: the trials in what was recorded.
+Session: the trials of a recorded session.
 
-Read are the sessions that `recording` writes, the part of one that a killed
-process left, and bags by anybody else with the topics of the calibrator.
+It reads sessions that `recording` wrote, also where the process was killed, and
+other bags that contain the topics of the calibrator.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from dlo_calibration.model.trial import Trial
 @dataclass(frozen=True)
 class Session:
     """
-    What a recorded session holds.
+    The content of a recorded session.
 
-    :param messages: (kind, message) of the input topics, in log order: what the
-        last calibration of the session stood on, or all since the last reset where
-        none was started.
-    :param records: every recorded message, outputs too, in log order.
-    :param recorded: the options that were recorded last, by name; None: none were.
-    :param problems: what is wrong with it, one text each, though it could be read.
+    :param messages: (kind, message) pairs of the input topics in log order: those that
+        the last calibration of the session used, or, where none was started, all since
+        the last reset.
+    :param records: all recorded messages, also outputs, in log order.
+    :param recorded: the last recorded options, by name; None: none were recorded.
+    :param problems: one text for each defect that did not prevent reading.
     """
 
     path: Path
@@ -52,25 +52,25 @@ class Session:
 
     @property
     def options(self) -> Options:
-        """The recorded options; where none were, the defaults."""
+        """The recorded options; the defaults where none were recorded."""
         return Options.of(self.recorded or {})
 
     @cached_property
     def trials(self) -> tuple[Trial, ...]:
-        """The complete trials, judged by the recorded options; `session_trials` tells what was refused."""
+        """The complete trials with the recorded options; `session_trials` also returns the refusals."""
         return session_trials(self, self.options)[0]
 
     def outputs(self, name: str) -> tuple[Any, ...]:
         """
-        Return the messages of the topics of that last name, e.g. ``result``, in log order.
+        Return the messages in log order of all topics that end in `name`, e.g. ``result``.
 
-        :raises InputError: for one that does not decode.
+        :raises InputError: where a message does not decode.
         """
         return tuple(decode(record) for record in self.records if record.name == name)
 
 
 def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Record, ...]:
-    """Return the records of a session in which a robot does given trials; see `trial_messages`."""
+    """Return the records of a session in which a robot does the given trials; see `trial_messages`."""
     types, records = bag_types(), []
     for message in trial_messages(tuple(trials), frame_id):
         built = action_trajectory(types, message) if isinstance(message, ActionMessage) else \
@@ -81,7 +81,7 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
 
 
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
-    """Return the complete trials of a session, and why messages are not used."""
+    """Return the complete trials of a session, and the reasons why messages are not used."""
     collector = TrialCollector(options)
     usable, refusals = [], []
     for kind, message in session.messages:
@@ -103,10 +103,10 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
     """
     Read an MCAP file, a rosbag2 folder, or a .db3 file.
 
-    Input topics are known by the last component of their name and their type.
+    Input topics are recognised by the last component of their name and by their type.
 
-    :param namespace: of the input topics, e.g. ``/calibrator``, where several have them.
-    :raises InputError: where it cannot be read, or holds none of the input topics.
+    :param namespace: of the input topics, e.g. ``/calibrator``; needed where several namespaces have them.
+    :raises InputError: where the session cannot be read, or has none of the input topics.
     """
     path = Path(path)
     source = Bag(path)
@@ -141,7 +141,7 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
 
 def _input_topics(path: Path, records: Iterable[Record], namespace: str | None,
                   problems: list[str]) -> frozenset[str]:
-    """Return the names of the topics to read: one for each kind."""
+    """Return the names of the topics to read, at most one for each kind of message."""
     seen = {(record.topic, record.type): record for record in records}
     found: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES}
     for record in seen.values():

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-XML: documents read safely, checked by their schema, and written canonically.
+XML: documents that are read safely, checked by their schema, and written in one form.
 
-A document is UTF-8.  A document type declaration, an entity, a namespace (which
-could name a schema elsewhere), a processing instruction, and more bytes, depth or
-elements than a document of ours has are refused before anything is made of them;
-nothing is fetched.  Comments are allowed, and not kept.
+A document is in UTF-8.  The reader refuses document type declarations, entities,
+processing instructions, namespaces (they could name a schema elsewhere), and more
+bytes, depth or elements than a valid document needs, before it uses any content.
+It loads no other file.  Comments are allowed, and dropped.
 
-Written is one form only: attributes in the order of the schema, two blanks a
-level, numbers by their shortest text that reads back as the same number.
+The written form has the attributes in the order of the schema, two blanks per
+level, and each number as the shortest text that reads back as the same number.
 """
 
 from __future__ import annotations
@@ -29,21 +29,17 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import exact
 
-VERSION = '1'  # of both kinds of document
-MAXIMUM_SIZE = 64 * 2**20  # bytes
-MAXIMUM_ELEMENTS = 1_000_000
-MAXIMUM_DEPTH = 16
-PIECE = 2**16  # bytes that are parsed at once
-NOT_XML = re.compile('[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
-DECLARATION = re.compile(b'<!(DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)')
+MAXIMUM_SIZE = 64 * 2**20  # bytes; far above any real request, and small enough for the memory
+MAXIMUM_ELEMENTS = 1_000_000  # likewise
+MAXIMUM_DEPTH = 16  # the schemas need less than half
 
-#: What the patterns of the schemas mean, by how they begin.
+#: First two characters of a pattern in the schemas -> its meaning.
 PATTERNS = {'[+': 'a finite number', '-?': 'an integer', '\\S': 'a name without blanks'}
 
 
 def read_octets(path: str | Path, what: str, suggestion: str) -> bytes:
     """
-    Read a file that is not too large.
+    Read a file, up to one byte more than the largest allowed document.
 
     :raises InputError: where it cannot be read.
     """
@@ -58,11 +54,11 @@ def read_octets(path: str | Path, what: str, suggestion: str) -> bytes:
 
 def parse(octets: bytes, where: str, schema: str) -> Any:
     """
-    Return the root element of a document that agrees with a schema.
+    Return the root element of a document that is valid by a schema.
 
-    :param where: names the document in refusals, e.g. ``file result.xml``.
-    :param schema: name of the schema, which is that of the root element.
-    :raises InputError: which names the line and what is wrong there.
+    :param where: name of the document in errors, e.g. ``file result.xml``.
+    :param schema: name of the schema and of the root element.
+    :raises InputError: where it is not valid; the text names the line and the error there.
     """
     _check_octets(octets, where)
     parser = etree.XMLPullParser(
@@ -70,8 +66,9 @@ def parse(octets: bytes, where: str, schema: str) -> Any:
         load_dtd=False, dtd_validation=False, attribute_defaults=False, huge_tree=False, remove_comments=True)
     guard = _Guard(where)
     try:
-        for begin in range(0, len(octets), PIECE):
-            parser.feed(octets[begin:begin + PIECE])
+        piece = 2**16  # bytes, so that the guard sees a bad document before all of it is parsed
+        for begin in range(0, len(octets), piece):
+            parser.feed(octets[begin:begin + piece])
             guard.check(parser.read_events())
         root = parser.close()
     except (etree.XMLSyntaxError, ValueError, AssertionError) as error:
@@ -90,7 +87,7 @@ def parse(octets: bytes, where: str, schema: str) -> Any:
 
 
 def document(root: Any) -> bytes:
-    """Return an element as a document."""
+    """Return the document with a root element, as UTF-8 bytes."""
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding='UTF-8')) + b'\n'
 
@@ -110,34 +107,34 @@ def write_octets(path: str | Path, octets: bytes, what: str) -> None:
 
 def refused(where: str, element: Any, came: str, expected: str,
             remedy: str = 'correct the file') -> InputError:
-    """Return the error about an element."""
+    """Return the error that refuses an element."""
     line = f', line {element.sourceline}' if element.sourceline else ''
     return InputError(f'{where}{line}, element <{element.tag}>', came, expected, remedy)
 
 
 def new_root(tag: str) -> Any:
     """Return the root element of a new document."""
-    return etree.Element(tag, version=VERSION)
+    return etree.Element(tag, version='1')
 
 
 def add(parent: Any, tag: str, **attributes: Any) -> Any:
-    """Add an element; attributes that are None are left out."""
+    """Add an element, without the attributes that are None."""
     return etree.SubElement(parent, tag, {name: text_of(value) for name, value in attributes.items()
                                           if value is not None})
 
 
 def text_of(value: Any) -> str:
-    """Return a value as text that XML can hold and from which it is read back exactly."""
-    return NOT_XML.sub('\ufffd', exact(value))
+    """Return a value as text that XML allows, and that reads back as the same value."""
+    return re.sub('[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]', '\ufffd', exact(value))
 
 
 def number(where: str, element: Any, name: str) -> float:
-    """Return an attribute that the schema calls a number."""
+    """Return a numeric attribute; refuse one that is not finite."""
     return finite(where, element, name, element.get(name))
 
 
 def finite(where: str, element: Any, name: str, text: str) -> float:
-    """Return a text that the schema calls a number, of the attribute `name`."""
+    """Return the number in `text`, a value of the attribute `name`; refuse one that is not finite."""
     value = float(text)
     if not math.isfinite(value):
         raise refused(where, element, f'{name} {text!r}', 'a number below 1.8e308')
@@ -154,7 +151,7 @@ def add_chain(parent: Any, tag: str, chain: Chain, **attributes: Any) -> Any:
 
 
 def read_chain(where: str, element: Any) -> Chain:
-    """Return the chain whose points are in an element."""
+    """Return the chain that an element contains."""
     annotated = [point.get('hand') for point in element]
     if None in annotated and any(hand is not None for hand in annotated):
         point = element[annotated.index(None)]
@@ -170,7 +167,7 @@ def read_chain(where: str, element: Any) -> Chain:
 
 
 def read_vectors(where: str, element: Any) -> Floats:
-    """Return the x y z of the elements in an element, (n, 3)."""
+    """Return the attributes x y z of all children of an element, (n, 3)."""
     return np.array([[number(where, one, axis) for axis in 'xyz'] for one in element], dtype=float)
 
 
@@ -208,11 +205,11 @@ def _option(declaration: Declaration, text: str) -> Any:
             return tuple(text.split())
         return kind(text)
     except (KeyError, ValueError):
-        return declaration.checked(text)  # says which type it should have
+        return declaration.checked(text)  # its error names the expected type
 
 
 class _Guard:
-    """Looks at a document as it grows."""
+    """Checks the elements of a document while it is parsed."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -220,7 +217,7 @@ class _Guard:
         self._count = 0
 
     def check(self, events: Iterator[tuple[str, Any]]) -> None:
-        """Refuse what no document of ours has."""
+        """Refuse elements that no valid document contains."""
         for event, element in events:
             if event == 'end':
                 self._depth -= 1
@@ -251,7 +248,7 @@ def _check_octets(octets: bytes, where: str) -> None:
     except UnicodeDecodeError as error:
         raise InputError(f'{where}, line {_line(octets, error.start)}', 'bytes that are not UTF-8', 'UTF-8',
                          'save it in this encoding') from error
-    declared = DECLARATION.search(octets)
+    declared = re.search(b'<!(DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)', octets)
     if declared:
         raise InputError(f'{where}, line {_line(octets, declared.start())}',
                          f'a document type declaration ({declared[0].decode()} ...)',
@@ -273,7 +270,7 @@ def _schema(name: str) -> Any:
 
 
 def _schema_error(where: str, entry: Any, schema: str) -> InputError:
-    """Return the first thing that a schema does not allow, as a refusal."""
+    """Return an error in our words for the first error that the schema found."""
     expected = f'a document that {schema}.xsd allows'
     found = re.match(r"Element '([^']*)'(?:, attribute '([^']*)')?: (.*)", ' '.join(entry.message.split()))
     if found is None:
