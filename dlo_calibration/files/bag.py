@@ -158,7 +158,7 @@ class Bag:
                 for connection, log_time, data in reader.messages():
                     self.records.append(Record(connection.topic, connection.msgtype, bytes(data), log_time))
         except Exception as error:  # damaged files can raise anything
-            self._ended(path, before, error)
+            self._note_early_end(path, before, error)
 
     def read_mcap(self, path: Path) -> None:
         """Read an MCAP file to its end, or to the first damaged place."""
@@ -171,24 +171,24 @@ class Bag:
                     elif isinstance(entry, str):
                         self.problems.append(entry)
                     else:
-                        self._read_ours(entry)
+                        self._read_metadata(entry)
             except Exception as error:  # damaged files can raise anything
-                self._ended(path, before, error)
+                self._note_early_end(path, before, error)
 
-    def _read_ours(self, entries: Mapping[str, str]) -> None:
+    def _read_metadata(self, entries: Mapping[str, str]) -> None:
         if 'options' in entries:
             try:
                 options = json.loads(entries['options'])
             except ValueError:
                 options = None
             if isinstance(options, dict):
-                self.options = self._usable(options)
+                self.options = self._usable_options(options)
             else:
                 self.problems.append('recorded options that cannot be read are left out')
         if 'mark' in entries:
             self.marks.append((entries['mark'], len(self.records)))
 
-    def _usable(self, options: Mapping[str, Any]) -> dict[str, Any]:
+    def _usable_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options that this version knows and accepts."""
         usable = {}
         for name, value in options.items():
@@ -200,7 +200,7 @@ class Bag:
                 usable[name] = value
         return usable
 
-    def _ended(self, path: Path, before: int, error: Exception) -> None:
+    def _note_early_end(self, path: Path, before: int, error: Exception) -> None:
         """Note an early end of reading; raise an error where nothing was read."""
         why = 'the file ends too early' if isinstance(error, EndOfFile) else \
             ' '.join(f'{type(error).__name__}: {error}'.split())

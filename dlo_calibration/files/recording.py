@@ -27,7 +27,7 @@ from dlo_calibration.errors import DloCalibrationError
 OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
 METADATA_FILE = 'metadata.yaml'  # name and key are rosbag2's
 METADATA_KEY = 'rosbag2_bagfile_information'
-LATCHED = ('result', 'status', 'dlo_description', 'markers')  # topics that also send late subscribers the last one
+LATCHED = ('result', 'status', 'dlo_description', 'markers')  # late subscribers get the last message
 
 
 class RecordingError(DloCalibrationError):
@@ -100,7 +100,7 @@ class SessionWriter:
 
     def write_options(self, options: Mapping[str, Any]) -> None:
         """Record the current options, by name, so that a replay uses the same ones."""
-        self._write_ours('options', json.dumps(dict(options), sort_keys=True))
+        self._write_metadata_record('options', json.dumps(dict(options), sort_keys=True))
 
     def write_mark(self, mark: str) -> None:
         """
@@ -109,7 +109,7 @@ class SessionWriter:
         :param mark: ``start`` or ``reset``, the services that decide which
             messages a result uses.
         """
-        self._write_ours('mark', mark)
+        self._write_metadata_record('mark', mark)
 
     def close(self) -> None:
         """Write the index and the final metadata.yaml; closing twice does nothing."""
@@ -146,7 +146,7 @@ class SessionWriter:
             pass  # the first error is the one to report
         return RecordingError(self._failure)
 
-    def _write_ours(self, key: str, text: str) -> None:
+    def _write_metadata_record(self, key: str, text: str) -> None:
         with self._disk():
             self._writer.flush()
             self._writer.add_metadata(OUR_RECORD, {key: text})

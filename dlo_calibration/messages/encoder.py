@@ -57,7 +57,7 @@ def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage
             np.stack([positions for positions, _ in poses], axis=1),
             np.stack([turns for _, turns in poses], axis=1)))
     for goal in trial.goals:
-        found.append(ChainMessage(GOAL, at(goal.time), frame_id, _seen(trial, goal, groups)))
+        found.append(ChainMessage(GOAL, at(goal.time), frame_id, _annotated_goal(trial, goal, groups)))
     return sorted(found, key=order)
 
 
@@ -84,7 +84,7 @@ def _at_rest(hand: Hand, start: float, end: float) -> Hand:
                 np.repeat(hand.orientations[-1:], len(times), axis=0))
 
 
-def _seen(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain:
+def _annotated_goal(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain:
     latest = [hands for hands in groups if hands[0].start <= goal.time]
     return _annotated(goal.chain, latest[-1] if latest else (), [hand.name for hand in trial.holding(goal)])
 

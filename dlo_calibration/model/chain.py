@@ -91,13 +91,13 @@ class Chain:
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
             raise InputError(
-                'chain', f'NaN or infinity in point(s) {_some(bad)}', 'finite coordinates in metres',
+                'chain', f'NaN or infinity in point(s) {_listed(bad)}', 'finite coordinates in metres',
                 'leave such frames out, or fill the points before sending')
         gaps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         same = np.flatnonzero(gaps < MINIMUM_SPACING)
         if len(same):
             raise InputError(
-                'chain', f'coincident neighbours after point(s) {_some(same)}',
+                'chain', f'coincident neighbours after point(s) {_listed(same)}',
                 f'neighbours at least {MINIMUM_SPACING} m apart', 'remove the repeated points')
         object.__setattr__(self, 'points', points)
         if self.hands is not None:
@@ -145,6 +145,6 @@ class Chain:
         return parameters, np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _some(indices: NDArray[np.intp]) -> str:
+def _listed(indices: NDArray[np.intp]) -> str:
     shown = ', '.join(str(i) for i in indices[:5])
     return shown if len(indices) <= 5 else f'{shown} and {len(indices) - 5} more'

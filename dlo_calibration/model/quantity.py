@@ -37,15 +37,15 @@ def number(value: float | None) -> str:
 
 def measured(value: float | None, unit: str) -> str:
     """Return a physical value (SI) with its unit, for people: lengths in mm, coefficients without unit."""
-    return _joined([value], unit)
+    return _with_unit([value], unit)
 
 
 def interval(lower: float | None, upper: float | None, unit: str) -> str:
     """Return both ends of an interval (SI) with their unit, as `measured` writes one value."""
-    return _joined([lower, upper], unit)
+    return _with_unit([lower, upper], unit)
 
 
-def _joined(values: Sequence[float | None], unit: str) -> str:
+def _with_unit(values: Sequence[float | None], unit: str) -> str:
     if unit == 'm':
         values, unit = [None if value is None else 1e3 * value for value in values], 'mm'
     text = ' to '.join(map(number, values))

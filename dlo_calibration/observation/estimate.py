@@ -91,7 +91,7 @@ def start_point(trials: Sequence[Trial], space: ParameterSpace, table_height: fl
     return frozen_array([one.value / SCALE for one in found.values()])
 
 
-def _scaled(name: str, value: float, lowest: float, highest: float) -> PriorEstimate:
+def _on_scale(name: str, value: float, lowest: float, highest: float) -> PriorEstimate:
     """Return the estimate of a physical value (> 0, or nan) and its bounds, clipped to the scale."""
     def scaled(physical: float) -> float:
         return min(SCALE, max(0.0, BY_NAME[name].value(physical)))
@@ -130,9 +130,9 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) 
         for chain in lying:
             if level is not None and (chain.points[:, 2] < level + RESTING_BAND + SIGMAS * sigma).all() \
                     and not _near_itself(chain.points, places, sigma):
-                hold = max(hold, _straightening(_smoothed(chain, sigma), 5 * sigma))
-    return _Resting(_combined([(b.load, b.std) for b in balances]),
-                    _combined([(b.stretch, b.stretch_std) for b in balances]), len(balances), hold)
+                hold = max(hold, _friction_that_holds_bends(_smoothed(chain, sigma), 5 * sigma))
+    return _Resting(_weighted_mean([(b.load, b.std) for b in balances]),
+                    _weighted_mean([(b.stretch, b.stretch_std) for b in balances]), len(balances), hold)
 
 
 def _smoothed(chain: Chain, sigma: float) -> Chain:
@@ -142,7 +142,7 @@ def _smoothed(chain: Chain, sigma: float) -> Chain:
     return Chain(smoothed) if (steps > MINIMUM_SPACING).all() else chain
 
 
-def _combined(found: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+def _weighted_mean(found: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
     """Return the weighted mean of (value, standard deviation) pairs, and its bounds; nan if there is none."""
     usable = [(value, std) for value, std in found if np.isfinite(value) and np.isfinite(std) and std > 0]
     if not usable:
@@ -155,7 +155,7 @@ def _combined(found: Sequence[tuple[float, float]]) -> tuple[float, float, float
     return mean, max(mean, 0.0) - SIGMAS * std, max(mean, 0.0) + SIGMAS * std
 
 
-def _straightening(chain: Chain, visible: float) -> float:
+def _friction_that_holds_bends(chain: Chain, visible: float) -> float:
     """
     Return the least mu w / EI that keeps a lying DLO bent [1/m^3].
 
@@ -184,7 +184,7 @@ def _straightening(chain: Chain, visible: float) -> float:
     return most
 
 
-def _apart(chain: Chain) -> tuple[Floats, Floats]:
+def _pair_distances(chain: Chain) -> tuple[Floats, Floats]:
     """Return the distances of all pairs of points of a curve, along it and in space, (p,) [m] each."""
     places = np.linspace(0, chain.length, SAMPLES + 1)
     points = chain.resample(places)
@@ -213,7 +213,7 @@ def _flexibility(resting: _Resting, weight: float) -> PriorEstimate:
     if resting.hold > 0:
         held = BY_NAME['friction'].at_hundred * weight / resting.hold * FRICTION_MARGIN
         highest = held if lowest < held < highest else highest
-    return _scaled('flexibility', weight / load if load > 0 else math.nan, lowest, highest)
+    return _on_scale('flexibility', weight / load if load > 0 else math.nan, lowest, highest)
 
 
 def _elasticity(resting: _Resting, weight: float) -> PriorEstimate:
@@ -222,7 +222,7 @@ def _elasticity(resting: _Resting, weight: float) -> PriorEstimate:
     if not math.isfinite(high):
         return UNKNOWN
     highest = weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME['elasticity'].at_zero
-    return _scaled('elasticity', weight / stretch if low > 0 else math.nan,
+    return _on_scale('elasticity', weight / stretch if low > 0 else math.nan,
                    weight / (high * STIFFNESS_MARGIN), highest)
 
 
@@ -233,7 +233,7 @@ def _friction(resting: _Resting) -> PriorEstimate:
     most = BY_NAME['friction'].at_hundred
     halfway = math.sqrt(min(most, resting.hold / load) * most)  # of the bounds, on the scale
     lowest = resting.hold / (highest_load * STIFFNESS_MARGIN * FRICTION_MARGIN)
-    return _scaled('friction', halfway, lowest, most)
+    return _on_scale('friction', halfway, lowest, most)
 
 
 def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: float) -> PriorEstimate:
@@ -243,7 +243,7 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
     for trial in trials:
         seen = shown_goals(len(trial.goals))  # a few of hundreds: fewer make the bound wider, not wrong
         for chain in (trial.initial, *(trial.goals[k].chain for k in seen)):
-            along, space = _apart(chain)
+            along, space = _pair_distances(chain)
             spacing = float(np.linalg.norm(np.diff(chain.points, axis=0), axis=1).max())
             room = space * 1.2 + SIGMAS * sigma  # a chain cuts corners
             for k in np.flatnonzero(allowed):  # nearer parts cannot touch, see `self_contact`
@@ -254,5 +254,5 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
     levels = [] if table_height is None else [
         level - table_height for trial in trials for level in [resting_level(trial, table_height)]
         if level is not None and parameter.at_zero <= level - table_height <= parameter.at_hundred]
-    return _scaled('self_collision', float(np.median(levels)) if levels else math.nan, parameter.at_zero,
+    return _on_scale('self_collision', float(np.median(levels)) if levels else math.nan, parameter.at_zero,
                    largest)

@@ -28,9 +28,9 @@ def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float 
     sigma = noise(trials)
     rows = []
     for trial in trials:
-        touches = _comes_near_itself(trial)
+        touches = _may_touch_itself(trial)
         shown = {
-            'friction': touches or _reaches(trial, table_height), 'self_collision': touches,
+            'friction': touches or _may_touch_table(trial, table_height), 'self_collision': touches,
             'elasticity': _may_stretch(trial, space, sigma),
             'damping': any(not goal.stable for goal in trial.goals),
             'internal_damping': any(not goal.stable for goal in trial.goals),
@@ -43,7 +43,7 @@ def _chains(trial: Trial) -> list[Floats]:
     return [trial.initial.points, *(goal.chain.points for goal in trial.goals)]
 
 
-def _reaches(trial: Trial, table_height: float | None) -> bool:
+def _may_touch_table(trial: Trial, table_height: float | None) -> bool:
     """Tell whether the DLO may touch the table: it hangs low, or hands move it far."""
     if table_height is None:
         return False
@@ -53,7 +53,7 @@ def _reaches(trial: Trial, table_height: float | None) -> bool:
     return lowest < table_height + 0.1 + travel + swing  # 0.1 m to spare
 
 
-def _comes_near_itself(trial: Trial) -> bool:
+def _may_touch_itself(trial: Trial) -> bool:
     """
     Tell whether parts that are not neighbours may have touched.
 

@@ -111,7 +111,7 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
     most = max(1, (len(observed) - 1) // 7)  # a window has seven segments or more
     best: Balance | None = None
     for windows in dict.fromkeys(min(count, most) for count in (1, 2, 4, 8)):
-        found = _fitted(observed, along, ends[0], pins, windows, noise)
+        found = _fit_windows(observed, along, ends[0], pins, windows, noise)
         if found is None:
             break
         if best is None:
@@ -125,7 +125,7 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
     return best
 
 
-def _fitted(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
+def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
             noise: float) -> Balance | None:
     """Return the balance of a part in windows; knowledge about its last end is not used."""
     from scipy.integrate import trapezoid  # takes half a second to load

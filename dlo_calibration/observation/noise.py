@@ -32,8 +32,8 @@ def noise(trials: Sequence[Trial]) -> float:
         # The mean noise along the DLO went into the arc lengths, so it is missing in the differences.
         seen = 3 - 1 / len(chains)
         for order, weights in _differences(np.concatenate([[0.0], np.cumsum(steps)])).items():
-            rows.setdefault(order, []).append(_squares(weights, chains) / seen)
-    return _smallest(rows)
+            rows.setdefault(order, []).append(_squared_differences(weights, chains) / seen)
+    return _noise_level(rows)
 
 
 def _differences(places: Floats) -> dict[int, Floats]:
@@ -57,13 +57,13 @@ def _differences(places: Floats) -> dict[int, Floats]:
     return found
 
 
-def _squares(weights: Floats, chains: Floats) -> Floats:
+def _squared_differences(weights: Floats, chains: Floats) -> Floats:
     """Return the squared lengths of all differences of (g, n, 3) chains."""
     differences = weights @ chains
     return np.asarray(np.einsum('gij,gij->gi', differences, differences).ravel())
 
 
-def _smallest(squares: dict[int, list[Floats]]) -> float:
+def _noise_level(squares: dict[int, list[Floats]]) -> float:
     """Return the smallest root mean square of all orders, without kinks; nan where there is none."""
     estimates = []
     for rows in squares.values():
