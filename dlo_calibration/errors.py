@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The package's exceptions: one base, and what an unusable input is called."""
+"""The exceptions of the package: one base, and the error for an unusable input."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Bag:
         files = [self.path / name for name in names] or sorted(
             file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
         if not files:
-            raise self.unusable('a folder without recording', 'a rosbag2 folder, or an MCAP file',
+            raise self.unusable('a folder without a recording', 'a rosbag2 folder, or an MCAP file',
                                 'name the folder that holds the metadata.yaml')
         if about.get('compression_mode') not in (None, '', 'NONE', 'none'):
             self.read_rosbags(self.path)
@@ -145,7 +145,7 @@ class Bag:
             raise
         except Exception:  # damaged YAML can raise anything
             pass
-        self.problems.append(f'{METADATA_FILE} cannot be read; the files in the folder are taken as they are')
+        self.problems.append(f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
         return {}
 
     def read_rosbags(self, path: Path) -> None:

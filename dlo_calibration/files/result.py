@@ -259,5 +259,5 @@ def _check_physical(where: str, element: Any, space: ParameterSpace) -> None:
     physical, unit = space.reported(element.get('name'), number(where, element, 'value'))
     given = number(where, element, 'physical_value')
     if not math.isclose(given, physical, rel_tol=1e-3) or element.get('physical_unit') != unit:
-        raise refused(where, element, f'{given:g} {element.get("physical_unit")}, which is not what '
-                      f'{element.get("value")} is', f'{physical:g} {unit}', 'change both')
+        raise refused(where, element, f'{given:g} {element.get("physical_unit")} for the value '
+                      f'{element.get("value")}', f'{physical:g} {unit}', 'change both')

@@ -155,7 +155,8 @@ def read_chain(where: str, element: Any) -> Chain:
     annotated = [point.get('hand') for point in element]
     if None in annotated and any(hand is not None for hand in annotated):
         point = element[annotated.index(None)]
-        raise refused(where, point, "no attribute 'hand'", 'it at all points of the chain, or at none')
+        raise refused(where, point, "no attribute 'hand'",
+                      'the attribute at all points of the chain, or at none')
     try:
         return Chain(read_vectors(where, element),
                      None if None in annotated else np.array([int(hand) for hand in annotated], np.uint8),
@@ -229,8 +230,8 @@ class _Guard:
             self._depth += 1
             self._count += 1
             if self._depth > MAXIMUM_DEPTH:
-                raise refused(self._where, element, f'more than {MAXIMUM_DEPTH} elements in each other',
-                              'a document as this package writes it')
+                raise refused(self._where, element, f'elements nested more than {MAXIMUM_DEPTH} deep',
+                              'a document that this package writes')
             if self._count > MAXIMUM_ELEMENTS:
                 raise refused(self._where, element, f'more than {MAXIMUM_ELEMENTS} elements', 'fewer',
                               'use several files')

@@ -62,7 +62,7 @@ class NamedAction:
             value = getattr(self, name, None)
             if value is not None and not 1e-9 <= value <= MOST and not (
                     name == 'height' and value == 0 and self.may_be_flat):
-                raise self._refused(f'{name} {value:g}', f'a {name} above 0, of at most {MOST:g}')
+                raise self._refused(f'{name} {value:g}', f'a {name} above 0, at most {MOST:g}')
 
     @property
     def name(self) -> str:
@@ -251,7 +251,7 @@ class PushDown(_OneHand):
     This needs a DLO that another hand holds up, or that bridges a gap: a point on the
     table cannot be pushed down.
 
-    flexibility: much: the shape between the pushed point and what holds the DLO up.
+    flexibility: much: the shape between the pushed point and the support of the DLO.
     elasticity: some, where the DLO is held on both sides of the point and pushed beyond straight; otherwise
         nothing.
     friction: some: how far the part on the table is pushed out or pulled in.
@@ -330,7 +330,7 @@ class TwoHands(NamedAction):
         gap = float(np.linalg.norm(between))
         if self.motion == 'together' and self.distance > gap:
             raise self._refused(f'{self.distance:g} m together of hands {gap:.4g} m apart',
-                                'less than their distance', 'choose a smaller distance')
+                                'at most the distance between them', 'choose a smaller distance')
         if gap == 0:
             raise self._refused('two points at the same place', 'two places', 'grip elsewhere')
         shares = MOVING[self.moving]

@@ -182,7 +182,7 @@ class ParameterSpace:
         space = self.divided(2 * self.parts)
         values = {**self.fixed, **self.values(point)}
         for part in range(2, space.parts + 1):
-            whole = part_name((part + 1) // 2)  # part 1 is what the ratios relate to
+            whole = part_name((part + 1) // 2)  # part 1 has no ratio: the others relate to it
             values[part_name(part)] = BY_NAME[part_name(part)].default if whole == 'flexibility' else \
                 self.fixed.get(whole, self.values(point).get(whole, BY_NAME[whole].default))
         return space, space.point(values)
