@@ -223,7 +223,7 @@ def _elasticity(resting: _Resting, weight: float) -> PriorEstimate:
         return UNKNOWN
     highest = weight / low * STIFFNESS_MARGIN if low > 0 else BY_NAME['elasticity'].at_zero
     return _on_scale('elasticity', weight / stretch if low > 0 else math.nan,
-                   weight / (high * STIFFNESS_MARGIN), highest)
+                     weight / (high * STIFFNESS_MARGIN), highest)
 
 
 def _friction(resting: _Resting) -> PriorEstimate:
@@ -255,4 +255,4 @@ def _self_collision(trials: Sequence[Trial], table_height: float | None, sigma: 
         level - table_height for trial in trials for level in [resting_level(trial, table_height)]
         if level is not None and parameter.at_zero <= level - table_height <= parameter.at_hundred]
     return _on_scale('self_collision', float(np.median(levels)) if levels else math.nan, parameter.at_zero,
-                   largest)
+                     largest)

@@ -126,13 +126,13 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
 
 
 def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
-            noise: float) -> Balance | None:
+                 noise: float) -> Balance | None:
     """Return the balance of a part in windows; knowledge about its last end is not used."""
     from scipy.integrate import trapezoid  # takes half a second to load
 
     system = _System(along, first, pins, windows)
     freedom = sum(len(own) for own, _ in system.rows) * 3 - system.count
-    if freedom < 6:
+    if freedom < 6:  # too few measured coordinates beyond the unknowns
         return None
     shape = bezier_curve(along, observed, system.fine)
     # Only below a free end is the tension known before the fit: it is the weight that hangs there.
