@@ -5,13 +5,13 @@
 Collector: trials from messages, by the stamps in their headers.
 
 The trials depend only on the set of messages, not on the order of arrival: ROS
-does not order different topics, and a robot may publish an action only after it.
+does not order different topics, and a robot may publish an action only when it is over.
 
 - Messages are ordered by stamp; at equal stamps, the initial chain comes first,
   then the action, then the goal chain.
 - An initial chain begins a new trial if an action or a goal chain came since the
-  previous one.  Otherwise it replaces the previous one; from that one, if it is
-  less than 0.1 s older, the initial velocity is computed.
+  previous one.  Otherwise it replaces the previous one; if the two are less than
+  0.1 s apart, they give the initial velocity.
 - A trial's clock starts at its initial chain.  If the DLO is at rest then, the
   clock starts when the first hand closes (or at the first goal, if that is
   earlier), as nothing moves before.
@@ -24,12 +24,12 @@ does not order different topics, and a robot may publish an action only after it
 - A goal chain stamped before the first action of its trial waits unused, as
   that action may still arrive.
 
-A message that does not fit the earlier ones is refused, but remembered: it is used
-if a message arrives later, with an earlier stamp, after which it fits.  Actions and
-goal chains before the first initial chain wait (see `incomplete`).  When an initial
-chain with a later stamp arrives, they are refused together (see `take_news`).  A
-second message of the same kind and stamp (and the same hands) is refused, unless the
-first one was refused: then it replaces that one.
+A message that does not fit those with earlier stamps is refused, but remembered: it
+is used when a late message with an earlier stamp makes it fit.  Actions and goal
+chains before the first initial chain wait (see `incomplete`).  When an initial chain
+with a later stamp arrives, they are refused together (see `take_news`).  A second
+message of the same kind and stamp (and the same hands) is refused, unless the first
+one was refused: then it replaces that one.
 
 Of the messages that no trial uses, between half of KEPT and KEPT are remembered, the
 latest ones.  A message that is older than these is refused.
