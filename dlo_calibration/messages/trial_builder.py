@@ -39,7 +39,7 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Observation:
+class GoalView:
     """A usable goal chain; its annotation numbers the hands in `names`."""
 
     message: ChainMessage
@@ -64,7 +64,7 @@ class TrialBuilder:
     first: Key
     starts: list[ChainMessage] = field(default_factory=list)
     moves: list[Move] = field(default_factory=list)
-    observations: list[Observation] = field(default_factory=list)
+    views: list[GoalView] = field(default_factory=list)
     waiting: list[Message] = field(default_factory=list)
     refused: list[tuple[Message, InputError]] = field(default_factory=list)
     trial: Trial | None = None
@@ -72,12 +72,12 @@ class TrialBuilder:
     @property
     def busy(self) -> bool:
         """Tell whether the next initial chain begins a new trial."""
-        return bool(self.moves or self.observations or self.waiting or not self.starts)
+        return bool(self.moves or self.views or self.waiting or not self.starts)
 
     @property
     def complete(self) -> bool:
         """Tell whether the messages make a trial."""
-        return bool(self.moves and self.observations)
+        return bool(self.moves and self.views)
 
     @property
     def spare(self) -> int:
@@ -89,7 +89,7 @@ class TrialBuilder:
     def messages(self) -> list[Message]:
         """Return all messages of the segment, in order."""
         return sorted([*self.starts, *(one.message for one in self.moves), *self.waiting,
-                       *(one.message for one in self.observations),
+                       *(one.message for one in self.views),
                        *(message for message, _ in self.refused)], key=order)
 
     def extend(self, message: Message, options: Options) -> InputError | None:
@@ -104,7 +104,7 @@ class TrialBuilder:
             elif not self.moves:
                 self.waiting.append(message)
             else:
-                self.observations.append(self._observation(message, options))
+                self.views.append(self._view(message, options))
         except InputError as error:
             self.refused.append((message, error))
             return error
@@ -113,8 +113,8 @@ class TrialBuilder:
 
     def _move(self, action: ActionMessage, options: Options) -> Move:
         latest, numbered = self.starts[-1], action.names
-        if self.observations:
-            latest, numbered = self.observations[-1].message, self.observations[-1].names
+        if self.views:
+            latest, numbered = self.views[-1].message, self.views[-1].names
         chain = latest.chain
         grips: list[tuple[int, ...]] = []
         for name, position in zip(action.names, action.positions[0], strict=True):
@@ -138,7 +138,7 @@ class TrialBuilder:
         return Move(action, tuple(grips),
                      tuple(action.stamp + round(float(t) * NANOSECONDS) for t in action.times))
 
-    def _observation(self, goal: ChainMessage, options: Options) -> Observation:
+    def _view(self, goal: ChainMessage, options: Options) -> GoalView:
         start = self.starts[-1]
         if len(goal.chain) != len(start.chain):
             raise InputError(
@@ -166,7 +166,7 @@ class TrialBuilder:
             held_by = tuple(latest.names[k - 1] for k in numbers)
         elif not options.release:
             held_by = tuple(dict.fromkeys(name for move in finished for name in move.message.names))
-        return Observation(goal, latest.names, bool(finished) and not under_way, held_by)
+        return GoalView(goal, latest.names, bool(finished) and not under_way, held_by)
 
     def build(self, name: str) -> Trial:
         """Return the trial of a complete segment; the same object until a message changes it."""
@@ -180,14 +180,14 @@ class TrialBuilder:
         start, velocity = self.starts[-1], self._velocity()
         zero = start.stamp
         if velocity is None:
-            zero = min([self.observations[0].message.stamp, *(move.instants[0] for move in self.moves)])
+            zero = min([self.views[0].message.stamp, *(move.instants[0] for move in self.moves)])
         actions = tuple(
             Action(tuple(Hand(hand, move.grips[k], _seconds(move.instants, zero),
                               move.message.positions[:, k], move.message.orientations[:, k])
                          for k, hand in enumerate(move.message.names)))
             for move in self.moves)
         goals = tuple(Goal(one.message.chain, float(_seconds([one.message.stamp], zero)[0]), one.stable,
-                           one.held_by) for one in self.observations)
+                           one.held_by) for one in self.views)
         return Trial(name, start.chain, actions, goals, velocity)
 
     def _velocity(self) -> Floats | None:
