@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The exceptions of the package: one base, and the error for an unusable input."""
+"""The package's exceptions: one base class, unusable inputs, and simulations that fail."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class InputError(DloCalibrationError):
     """
     An input that cannot be used.
 
-    The message always answers the same four questions, so that a person who
-    reads it in a log can act without opening the code.
+    The message always answers the same four questions, so that its reader can act
+    without opening the code.
 
     :param thing: which input, e.g. ``goal_chain stamped 12.5 s``.
     :param came: what was found in it.
     :param expected: what would have been accepted.
-    :param remedy: what to do about it.
+    :param remedy: what the user can do.
     """
 
     def __init__(self, thing: str, came: str, expected: str, remedy: str) -> None:
@@ -38,7 +38,7 @@ class SimulationError(DloCalibrationError):
     """A trial that an engine cannot simulate, or a rollout that diverged."""
 
 
-def unwritable(path: object, error: OSError) -> InputError:
-    """Return the error for a file that cannot be written."""
-    return InputError(f'file {path}', str(error), 'a place that can be written to',
+def unwritable(path: object, error: OSError, kind: str = 'file') -> InputError:
+    """Return the error for a file, or another `kind` of path, that cannot be written."""
+    return InputError(f'{kind} {path}', str(error), 'a place that can be written to',
                       'choose another one with --output')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals: SIGINT and SIGTERM set a flag, and nothing is interrupted."""
+"""Signals: SIGINT and SIGTERM set a flag instead of interrupting the program."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ import threading
 from types import FrameType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from Ctrl-C; from `kill` and `ros2 launch`
 
 
 class StopFlag:
-    """Becomes true, and stays so, when SIGINT or SIGTERM arrives."""
+    """A flag that becomes true, and stays true, when SIGINT or SIGTERM arrives."""
 
     def __init__(self) -> None:
-        # A plain attribute: a handler may interrupt whoever holds a lock.
+        # Not a threading.Event: its lock may be held by the code that the handler interrupts.
         self._raised = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __call__(self) -> bool:
-        """Tell whether to end."""
+        """Tell whether a signal has arrived."""
         return self._raised
 
     def listen(self) -> None:
-        """Take the signals; only the main thread can, elsewhere this does nothing."""
+        """Handle the signals from now on; only the main thread can, so this does nothing elsewhere."""
         self._handle(self._raise)
 
     def __enter__(self) -> StopFlag:
-        """Listen for as long as the block lasts."""
+        """Handle the signals until the block ends."""
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.getsignal(number) for number in SIGNALS}
         self.listen()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the signals to whoever had them before."""
+        """Restore the handlers from before the block."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def ignore(self) -> None:
-        """Let later signals pass, so that nothing disturbs the interpreter's own end."""
+        """Ignore later signals, so that they cannot disturb the interpreter's shutdown."""
         self._handle(signal.SIG_IGN)
 
     def _handle(self, handler: object) -> None:

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The executable `calibrator`: listens to signals first, and loads ROS only then.
+The executable `calibrator`: installs its signal handlers before it loads ROS.
 
-So SIGINT and SIGTERM end it cleanly while it is still starting, too.
+So SIGINT and SIGTERM end it cleanly even while it is starting.
 """
 
 from __future__ import annotations
@@ -14,22 +14,18 @@ from typing import Sequence
 
 from dlo_calibration.signals import StopFlag
 
-USAGE = """usage: calibrator [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
-
-Calibrates a deformable linear object from messages; ends on SIGINT or SIGTERM.
-"""
-
 
 def main(args: Sequence[str] | None = None) -> int:
     """
     Run the node until a signal arrives.
 
     :param args: command line without the program's name; None: that of the process.
-    :returns: exit code: 0, or 2 for what cannot be used, after one line on stderr.
+    :returns: exit code: 0; 2, with one line on stderr, if an argument, a parameter or ROS cannot be used.
     """
     args = list(sys.argv[1:] if args is None else args)
     if args in (['-h'], ['--help']):
-        sys.stdout.write(USAGE)
+        sys.stdout.write('usage: calibrator [--ros-args -p NAME:=VALUE ... --params-file FILE ...]\n\n'
+                         'Calibrates a deformable linear object from messages; ends on SIGINT or SIGTERM.\n')
         return 0
     stop = StopFlag()
     stop.listen()
@@ -38,7 +34,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
         return spin(args, stop)
     except ImportError as error:
-        if stop():  # what is half imported when a signal arrives may fail in any way
+        if stop():  # an import that a signal disturbs may fail in any way
             return 0
         sys.stderr.write(f'calibrator: {error}; source a ROS 2 Jazzy installation, or install the '
                          "libraries with pip install 'dlo_calibration[ros]'\n")

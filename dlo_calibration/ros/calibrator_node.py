@@ -4,7 +4,7 @@
 """
 The node: subscriptions, publishers, services and a timer around a `CalibrationSession`.
 
-Nothing is decided here but how to reach those who publish.
+The session makes all decisions, except one: the node adapts its subscriptions to what publishers offer.
 """
 
 from __future__ import annotations
@@ -34,30 +34,23 @@ from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.parameters import OptionsNode
 from dlo_calibration.ros.session import CalibrationSession, DEFECT
 
-LOG = logging.getLogger('dlo_calibration')  # notices of the rest of the package
-DEPTH = 2000  # messages that may wait while another callback works: a burst of goal chains
-RELIABLE = QoSProfile(depth=DEPTH)
-BEST_EFFORT = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PROGRESS = QoSProfile(depth=10)  # not latched: who comes late has no use for it
-#: What a bad command line raises; nothing public has them.
-ARGUMENT_ERRORS = (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError)
-TICK = 0.05  # s between two looks of the session at what is due
+LOG = logging.getLogger('dlo_calibration')  # where the rest of the package logs its notices
+TICK = 0.05  # s between two ticks of the session, short enough for its shortest period (progress)
 
 
 def spin(args: Sequence[str], should_stop: Callable[[], bool],
          make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
     """
-    Be the node until `should_stop`; handles no signal itself.
+    Run the node until `should_stop` returns true; the caller handles the signals.
 
     :param args: command line without the program's name.
-    :returns: exit code: 0, or 2 for what cannot be used, after one line on stderr.
+    :returns: exit code: 0; 2, with one line on stderr, if an argument or a parameter cannot be used.
     """
     node, executor = None, None
     try:
-        strange = remove_ros_args(['calibrator', *args])[1:]
-        if strange:
-            raise InputError('command line', ' '.join(strange), 'only --ros-args ...',
+        unknown = remove_ros_args(['calibrator', *args])[1:]
+        if unknown:
+            raise InputError('command line', ' '.join(unknown), 'only --ros-args ...',
                              'set a parameter with --ros-args -p NAME:=VALUE')
         if should_stop():
             return 0
@@ -69,7 +62,8 @@ def spin(args: Sequence[str], should_stop: Callable[[], bool],
             executor.spin_once(timeout_sec=TICK)
     except ExternalShutdownException:
         pass
-    except (InputError, *ARGUMENT_ERRORS) as error:
+    # rclpy raises the last two for a bad command line, and has no public names for them.
+    except (InputError, rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
         sys.stderr.write(f'calibrator: {" ".join(str(error).split())}\n')
         return 2
     finally:
@@ -89,7 +83,7 @@ class _Notices(logging.Handler):
         self._tell = tell
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Pass one on."""
+        """Pass one notice on."""
         self._tell(record.getMessage())
 
 
@@ -107,22 +101,24 @@ class CalibratorNode(OptionsNode):
         self._notices = _Notices(self.warn)
         LOG.addHandler(self._notices)
         types = rclpy_types()
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        # Progress is not latched: a late subscriber has no use for an old one.
         self._outputs = {name: self.create_publisher(types.find(kind), f'~/{name}',
-                                                     PROGRESS if name == 'progress' else LATCHED)
+                                                     QoSProfile(depth=10) if name == 'progress' else latched)
                          for name, kind in OUTPUT_TYPES.items()}
         self._input_classes = {kind: types.find(name) for kind, name in INPUT_TYPES.items()}
         self.session = CalibrationSession(self, types, make_simulator)
         self._closed = False
-        self._deaf: set[str] = set()  # inputs that a best-effort publisher cannot reach
-        self._inputs = {kind: self._subscribe(kind, RELIABLE) for kind in INPUT_TYPES}
+        self._incompatible: set[str] = set()  # inputs that a best-effort publisher cannot reach
+        self._inputs = {kind: self._subscribe(kind, ReliabilityPolicy.RELIABLE) for kind in INPUT_TYPES}
         for name in ('start', 'stop', 'reset'):
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
-        # Steady: with use_sim_time and no /clock, a timer of the node's own clock would never fire.
+        # A steady clock: with use_sim_time and no /clock, a timer on the node's own clock would never fire.
         self.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.info('collecting trials; call ~/start to calibrate')
 
     def close(self) -> None:
-        """End the session, and destroy the node; closing twice does nothing."""
+        """End the session and destroy the node; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -135,7 +131,7 @@ class CalibratorNode(OptionsNode):
             self.destroy_node()
 
     def changed(self, names: Sequence[str]) -> None:
-        """Take note that parameters have new values."""
+        """Log that new values have to wait, if a calibration is under way."""
         if self.session.calibrating:
             self.info(f'{", ".join(names)}: takes effect at the next start')
 
@@ -145,30 +141,33 @@ class CalibratorNode(OptionsNode):
 
     # Subscriptions
 
-    def _subscribe(self, kind: str, qos: QoSProfile) -> Any:
+    def _subscribe(self, kind: str, reliability: ReliabilityPolicy) -> Any:
+        # The queue holds a burst of goal chains while another callback works.
         return self.create_subscription(
-            self._input_classes[kind], f'~/{kind}', functools.partial(self.session.hear, kind), qos, raw=True,
+            self._input_classes[kind], f'~/{kind}', functools.partial(self.session.hear, kind),
+            QoSProfile(depth=2000, reliability=reliability), raw=True,
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self._meet_incompatible, kind)))
+                incompatible_qos=functools.partial(self._on_incompatible_qos, kind)))
 
-    def _meet_incompatible(self, kind: str, event: Any) -> None:
+    def _on_incompatible_qos(self, kind: str, event: Any) -> None:
         if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
-            self._deaf.add(kind)  # the next tick replaces it, not its own callback
+            self._incompatible.add(kind)  # replaced at the next tick, as its own callback cannot destroy it
         else:
-            self.warn(f'{kind}: a publisher cannot be heard, its quality of service does not match; '
+            self.warn(f'{kind}: no messages arrive from a publisher whose quality of service does not match; '
                       'publish with reliable or best-effort reliability and default deadlines')
 
-    def _hear_best_effort(self) -> None:
-        """Replace subscriptions that a best-effort publisher cannot reach."""
-        while self._deaf:
-            kind = self._deaf.pop()
-            old, self._inputs[kind] = self._inputs[kind], self._subscribe(kind, BEST_EFFORT)
-            self._empty(kind, old)
+    def _subscribe_best_effort(self) -> None:
+        """Subscribe with best effort where a reliable subscription cannot reach a publisher."""
+        while self._incompatible:
+            kind = self._incompatible.pop()
+            old = self._inputs[kind]
+            self._inputs[kind] = self._subscribe(kind, ReliabilityPolicy.BEST_EFFORT)
+            self._drain(kind, old)
             self.destroy_subscription(old)
-            self.info(f'{kind}: a publisher offers best effort only; listening so')
+            self.info(f'{kind}: a publisher offers best effort only, so the node subscribes with best effort')
 
-    def _empty(self, kind: str, subscription: Any) -> None:
-        """Take what waits in a subscription's queue."""
+    def _drain(self, kind: str, subscription: Any) -> None:
+        """Pass the messages in a subscription's queue to the session."""
         with subscription.handle:
             while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
                 self.session.hear(kind, taken[0])
@@ -181,7 +180,7 @@ class CalibratorNode(OptionsNode):
 
     def _tick(self) -> None:
         try:
-            self._hear_best_effort()
+            self._subscribe_best_effort()
             self.session.tick()
         except Exception as error:  # a callback that raises would end the node
             self.session.fail(f'{error!r}; {DEFECT}')
@@ -193,7 +192,7 @@ class CalibratorNode(OptionsNode):
         return int(self.get_clock().now().nanoseconds)
 
     def topic(self, name: str) -> str:
-        """Return the node's own name for one of its topics, whatever that is remapped to."""
+        """Return the full name of one of the node's topics, before any remapping."""
         return f'{self.get_fully_qualified_name()}/{name}'
 
     def decode(self, kind: str, octets: bytes) -> Any:
@@ -211,7 +210,7 @@ class CalibratorNode(OptionsNode):
     def hear_waiting(self) -> None:
         """Pass on the messages that wait in the queues of the subscriptions."""
         for kind, subscription in self._inputs.items():
-            self._empty(kind, subscription)
+            self._drain(kind, subscription)
 
     def info(self, text: str) -> None:
         """Log a text."""

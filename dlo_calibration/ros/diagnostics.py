@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics: what the node tells of its progress, its result and its status, as messages."""
+"""Diagnostics: builds the messages about the node's progress, result and status."""
 
 from __future__ import annotations
 
@@ -25,10 +25,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
 }
 STATES = ('collecting', 'calibrating', 'done', 'failed')
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
-VALUE_UNIT = '0..100'  # of value, std, lower and upper of a result
-WHOLE = 'calibration'  # name of the status that speaks of the whole result
-#: Plain values that have a status or keys of their own, or are too long for a message.
-NOT_TOLD = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
+WHOLE = 'calibration'  # name of the status about the whole result; the others have a parameter's name
 
 
 def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: Evaluation, evaluations: int,
@@ -37,10 +34,10 @@ def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: E
     """
     Build the message about one finished evaluation.
 
-    :param evaluation: the one that has finished; counted from 1 in the message.
+    :param evaluation: the finished one; the message counts from 1.
     :param best: the best so far.
-    :param evaluations: how many there will be.
-    :param spread: of each parameter over the best evaluations so far (0..100), see `worker.Progress`.
+    :param evaluations: the largest number of evaluations of this search.
+    :param spread: of each parameter over the best evaluations so far (0..100), see `Progress`.
     """
     values: dict[str, Any] = {
         'evaluation': evaluation.index + 1, 'evaluations': evaluations, 'score': evaluation.score,
@@ -56,29 +53,31 @@ def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: E
 
 
 def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
-    """Build the message with the final parameter set: one status per parameter, one for the whole."""
+    """Build the message with the final parameters: one status for each, and one about the whole result."""
     told = plain(found)
     statuses = []
     for name, row in told['parameters'].items():
         message = (f'{number(row["value"])} ({interval(row["lower"], row["upper"], "1")}), '
                    f'{measured(row["physical_value"], row["physical_unit"])}')
         if not row['identifiable']:
-            message += f'; {row["verdict"] or "the trials could not tell it"}'
+            message += f'; {row["verdict"] or "not identifiable from these trials"}'
         scale = {key: row.pop(key) for key in ('value', 'std', 'lower', 'upper')}
         statuses.append(_status(types, OK if row['identifiable'] else WARN, name, message,
-                                {**scale, 'unit': VALUE_UNIT, **row}))
+                                {**scale, 'unit': '0..100', **row}))
+    # These have a status or keys of their own, or are too long for a message.
+    left_out = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
     statuses.append(_status(
         types, WARN if found.warnings else OK, WHOLE,
         f'score {number(found.best.score)}, mean error {measured(found.errors.mean, "m")}; '
         f'{found.stop_reason}',
-        {**_pairs({key: told[key] for key in told if key not in NOT_TOLD}),
+        {**_pairs({key: told[key] for key in told if key not in left_out}),
          'findings': ' '.join(sentences.sentences(found)),
          **_pairs(told['confirmation'] or {}, 'confirmation_')}))
     return _diagnostics(types, stamp, statuses)
 
 
 def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Return plain values as a message has them: lengths in mm, texts joined by '; ', '' for None."""
+    """Convert plain values for a message: lengths to mm, lists of texts to one text, None to ''."""
     pairs = {}
     for key, value in told.items():
         if key.endswith('_m'):
@@ -89,41 +88,28 @@ def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     return pairs
 
 
-def result_values(message: Any) -> dict[str, dict[str, float | str | bool]]:
-    """Read the parameters of a `result` message: name -> key -> number, text or truth."""
-    found: dict[str, dict[str, float | str | bool]] = {}
-    for one in message.status:
-        if one.name != WHOLE:
-            values = {pair.key: pair.value for pair in one.values}
-            found[one.name] = {
-                key: value == 'true' if key == 'identifiable' else
-                value if key.endswith(('unit', 'verdict', 'note')) else float(value)
-                for key, value in values.items()}
-    return found
-
-
 def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '', told: TrialInformation | None = None) -> Any:
+           incomplete: str = '', detail: str = '', information: TrialInformation | None = None) -> Any:
     """
     Build the message about what the node is doing.
 
     :param state: one of STATES.
     :param trials: number of complete trials.
-    :param last_refusal: text of the last refusal; empty where there was none.
-    :param incomplete: what the newest trial lacks; empty where nothing.
-    :param detail: of the state, e.g. why it failed.
-    :param told: what the newest trial tells, once it is known.
+    :param last_refusal: text of the last refusal; empty if there was none.
+    :param incomplete: what the newest trial lacks; empty if it is complete.
+    :param detail: about the state, e.g. why the calibration failed.
+    :param information: about the newest trial; None until it is known.
     """
     if state not in STATES:
         raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
     message = f'{state}: {detail}' if detail else state
-    last_trial = '' if told is None else told.words
+    last_trial = '' if information is None else information.words
     if last_trial and state == 'collecting':
         message += f'; {last_trial}'
     return _diagnostics(types, stamp, [_status(
         types, ERROR if state == 'failed' else OK, 'status', message,
         {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
-         'detail': detail, 'last_trial': last_trial, **({} if told is None else told.values)})])
+         'detail': detail, 'last_trial': last_trial, **({} if information is None else information.values)})])
 
 
 def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:

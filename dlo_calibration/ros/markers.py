@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Markers: trials and what was simulated of them, to be seen in RViz and Foxglove."""
+"""Markers: show trials and their rollouts in RViz and Foxglove."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.drawing import hand_path
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
-CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9  # visualization_msgs/Marker
+# Types and actions of visualization_msgs/Marker.
+CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9
 ADD, DELETE_ALL = 0, 3
 
-MOST_POINTS = 200  # of a chain or path; more are not to be told apart
-THICKNESS = 0.01  # of a line, relative to the length of the DLO
-#: Error [share of the DLO's length] that is shown all red; half of it is yellow, none is green.
-RED_ERROR = 0.03
+MOST_POINTS = 200  # drawn of a chain or path; closer points cannot be told apart on a screen
 
+# Red, green and blue from 0 to 1: they differ in hue, and are bright enough for a dark background.
 Colour = tuple[float, float, float]
 INITIAL_COLOUR, GOAL_COLOUR, SIMULATED_COLOUR = (0.6, 0.6, 0.6), (0.25, 0.6, 1.0), (1.0, 0.55, 0.1)
 TEXT_COLOUR = (0.9, 0.9, 0.9)
@@ -36,13 +35,13 @@ HAND_COLOURS = ((0.2, 0.8, 0.3), (0.75, 0.45, 0.9), (0.75, 0.55, 0.4), (0.95, 0.
 def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_id: str,
             result: CalibrationResult | None = None) -> Any:
     """
-    Build the message that shows trials; it takes the place of any message before it.
+    Build the message that shows trials; it replaces everything that earlier messages show.
 
     Namespaces are ``trial_1/initial``, ``/goal``, ``/simulated``, ``/error``, ``/hands``, ``/label``.
-    The same thing has the same id in every message: ids follow from the index of a goal or a hand.
+    An id follows from the index of a goal or a hand, so it is the same in every message.
 
     :param frame_id: of the session.
-    :param result: what is simulated of those `trials` that it was found with.
+    :param result: its rollouts are shown with those of `trials` that it was calibrated on.
     """
     header = types.header(stamp, frame_id)
     built = [_Brush(types, header, '', 1.0).marker('', 0, SPHERE, action=DELETE_ALL)]
@@ -50,14 +49,18 @@ def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_i
         trial.name: (trial, chains) for trial, chains in zip(result.trials, result.chains, strict=True)}
     for k, trial in enumerate(trials):
         of_result, chains = simulated.get(trial.name, (trial, None))
-        brush = _Brush(types, header, f'trial_{k + 1}', THICKNESS * trial.initial.length)
+        brush = _Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length)
         built += _trial_markers(brush, trial, chains if _same(trial, of_result) else None, k)
     return types.build(OUTPUT_TYPES['markers'], markers=built)
 
 
 def error_colour(share: float) -> Colour:
-    """Return red, green and blue of a point error, given as a share of the DLO's length."""
-    red = min(max(share / RED_ERROR, 0.0), 1.0)
+    """
+    Return the colour of a point error: green for none, yellow for 1.5 % of the length, red from 3 % on.
+
+    :param share: the error divided by the DLO's length.
+    """
+    red = min(max(share / 0.03, 0.0), 1.0)
     return min(2 * red, 1.0), min(2 - 2 * red, 1.0), 0.1
 
 
@@ -83,14 +86,14 @@ def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -
     if chains is not None:
         errors = PointErrors.of(residuals(trial, chains))
         text += f': mean error {measured(errors.mean, "m")}, max {measured(errors.max, "m")}'
-    # Trials happen in the same place; their labels are stacked.
+    # Labels are stacked, because trials happen in the same place.
     above = [0.0, 0.0, brush.thickness * (6 + 5 * k)]
     yield brush.label('label', 0, trial.initial.points[0] + above, text)
 
 
 def _error_markers(brush: _Brush, goal: int, points: Floats, simulated: Floats,
                    length: float) -> Iterator[Any]:
-    """Show the error of each point: a sphere where it was simulated, and a line to where it was."""
+    """Show each point's error: a sphere at the simulated point, and a line to the measured one."""
     colours = [error_colour(float(error) / length)
                for error in np.linalg.norm(simulated - points, axis=1)]
     yield brush.spheres('error', 2 * goal, simulated, colours, 1.7)
@@ -100,7 +103,7 @@ def _error_markers(brush: _Brush, goal: int, points: Floats, simulated: Floats,
 
 
 def _hand_markers(brush: _Brush, first: int, hand: Hand, colour: Colour, trial: Trial) -> Iterator[Any]:
-    """Show a hand's path, the points that it grips as it closes, and where it opens."""
+    """Show a hand's path, the points that it grips, and the place where it opens."""
     path = hand_path(hand)
     if np.ptp(path, axis=0).max() > 0:
         yield brush.line('hands', first, path, colour, 0.5)
@@ -112,15 +115,15 @@ class _Brush:
     """
     Draws the markers of one trial.
 
-    :param space: that all namespaces begin with.
-    :param thickness: of a line [m]; the scales given to its methods are multiples of that.
+    :param prefix: first part of all namespaces, e.g. ``trial_1``.
+    :param thickness: of a line [m]; the `scale` of a marker is a multiple of it.
     """
 
-    def __init__(self, types: MessageTypes, header: Any, space: str, thickness: float) -> None:
+    def __init__(self, types: MessageTypes, header: Any, prefix: str, thickness: float) -> None:
         self.thickness = thickness
         self._types = types
         self._header = header
-        self._space = space
+        self._prefix = prefix
 
     def line(self, name: str, number: int, points: Floats, colour: Colour, scale: float = 1.0) -> Any:
         """Draw a line through (n, 3) points [m]."""
@@ -128,11 +131,11 @@ class _Brush:
 
     def spheres(self, name: str, number: int, points: Floats, colours: Sequence[Colour],
                 scale: float) -> Any:
-        """Draw a sphere at each of (n, 3) points [m], of one colour or of a colour each."""
+        """Draw a sphere at each of (n, 3) points [m]; `colours` has one for all, or one for each."""
         return self.marker(name, number, SPHERE_LIST, points=points, colours=colours, scale=scale)
 
     def label(self, name: str, number: int, at: Floats, text: str) -> Any:
-        """Write text at a place, (3,) [m]."""
+        """Write text at a position, (3,) [m]."""
         return self.marker(name, number, TEXT, at=at, colours=[TEXT_COLOUR], scale=4.0, text=text)
 
     def marker(self, name: str, number: int, kind: int, *, points: Floats | None = None,
@@ -141,18 +144,18 @@ class _Brush:
         """
         Build a marker.
 
-        :param points: (n, 3) [m] of a list or strip, as `group`s that stay together.
-        :param at: (3,) [m] where it is; None: at the origin.
-        :param colours: one of the whole, or one per point.
+        :param points: (n, 3) [m] of a list or strip; a long one keeps only some groups of `group` points.
+        :param at: (3,) [m] position; None: the origin.
+        :param colours: one for the whole marker, or one per point.
         """
         build = self._types.build
         points = np.zeros((0, 3)) if points is None else points
         kept = _kept(len(points), group)
         x, y, z = (0.0, 0.0, 0.0) if at is None else (float(value) for value in at)
         size = scale * self.thickness
-        # Only the first number counts for lines, only the last for text.
+        # In `scale`, lines use only x, and texts only z.
         return build(
-            'visualization_msgs/msg/Marker', header=self._header, ns=f'{self._space}/{name}' if name else '',
+            'visualization_msgs/msg/Marker', header=self._header, ns=f'{self._prefix}/{name}' if name else '',
             id=number, type=kind, action=action,
             pose=build('geometry_msgs/msg/Pose', position=build('geometry_msgs/msg/Point', x=x, y=y, z=z),
                        orientation=build('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)),

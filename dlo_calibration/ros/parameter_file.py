@@ -4,7 +4,7 @@
 """
 Parameter file: ``config/calibrator.yaml``, every parameter of the node with a comment.
 
-The file is generated from the declarations of the options. After a change of those, make it again with
+The file is generated from the declarations of the options. When one of them changes, generate it again:
 
     python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
@@ -30,8 +30,6 @@ This file is generated:
 
     python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
 """
-WIDTH = 100  # columns
-INDENT = '    '
 
 
 def parameter_file() -> str:
@@ -43,13 +41,13 @@ def parameter_file() -> str:
 def _entry(declaration: Declaration) -> str:
     """Return the lines of one option: what it is, its unit and range, its default."""
     text = declaration.description[0].upper() + declaration.description[1:] + '.'
-    lines = textwrap.wrap(text, WIDTH - len(INDENT) - 2, break_on_hyphens=False)
+    width = 100 - len('    # ')  # of a line without its indent
+    lines = textwrap.wrap(text, width, break_on_hyphens=False)
     if allowed := _allowed(declaration):
-        lines += textwrap.wrap(allowed, WIDTH - len(INDENT) - 2, subsequent_indent='  ')
+        lines += textwrap.wrap(allowed, width, subsequent_indent='  ')
     value = list(declaration.default) if isinstance(declaration.default, tuple) else declaration.default
-    # JSON is YAML, with a type that nobody can mistake.
-    return ''.join(f'{INDENT}# {line}\n' for line in lines) + \
-        f'{INDENT}{declaration.name}: {json.dumps(value)}\n'
+    # JSON is valid YAML, and its types are unambiguous.
+    return ''.join(f'    # {line}\n' for line in lines) + f'    {declaration.name}: {json.dumps(value)}\n'
 
 
 def _allowed(declaration: Declaration) -> str:

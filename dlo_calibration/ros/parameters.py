@@ -5,7 +5,7 @@
 OptionsNode: a ROS node whose parameters are the options of the package.
 
 Names, types, descriptors and ranges come from the declarations of the options;
-an unknown name and a value out of range are refused.
+unknown names and values out of range are refused.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rclpy.parameter import Parameter
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
 
-ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')  # declared by rclpy
-
+#: Beginnings of the names of the parameters that rclpy declares itself.
+ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 DECLARED: Mapping[str, Declaration] = {declaration.name: declaration for declaration in declarations()}
 
 
@@ -45,14 +45,14 @@ class OptionsNode(Node):
         return Options.of({name: _plain(self.get_parameter(name).value) for name in DECLARED})
 
     def changed(self, names: Sequence[str]) -> None:
-        """Take note that parameters have new values; for a subclass to say more."""
+        """Do nothing; a subclass may override it to learn which parameters have new values."""
 
     def refuse(self, text: str) -> None:
-        """Tell why something was refused; for a subclass to say it elsewhere, too."""
+        """Log why something was refused; a subclass may report it elsewhere, too."""
         self.get_logger().warning(text)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters together, as `rclpy.node.Node` does; what is refused is told as a message is."""
+        """Set parameters together, as `rclpy.node.Node` does; a refusal is reported by `refuse`."""
         try:
             _checked({**self.options().flat(), **{
                 p.name: _plain(p.value) for p in parameter_list if not p.name.startswith(ROS_PARAMETERS)}})
@@ -62,7 +62,7 @@ class OptionsNode(Node):
         return super().set_parameters_atomically(parameter_list)
 
     def _declare(self) -> None:
-        """Declare the parameters; what the user gave was declared by rclpy already, as it came."""
+        """Declare the parameters; those that the user gave replace what rclpy declared without a range."""
         given = {name: _plain(one.value) for name, one in self.get_parameters_by_prefix('').items()
                  if not name.startswith(ROS_PARAMETERS)}
         chosen = _checked(given)
@@ -85,26 +85,26 @@ class OptionsNode(Node):
 
 
 def _checked(flat: Mapping[str, Any]) -> Options:
-    """Return options, or refuse them, also for what only several together show."""
+    """Return options; raise InputError for a bad value, or for values that contradict each other."""
     options = Options.of(flat)
-    options.space  # noqa: B018
+    options.space  # checks several options together  # noqa: B018
     return options
 
 
 def _plain(value: Any) -> Any:
-    """Return a parameter's value as options take it."""
+    """Return a parameter's value in the type that options expect; an array becomes a list."""
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 def _as_declared(parameters: list[Parameter]) -> list[Parameter]:
-    """Let an integer be set where a number is declared, as `ros2 param set` sends it."""
+    """Convert integers to floats where a float is declared: `ros2 param set` sends an integer for 1."""
     return [Parameter(p.name, Parameter.Type.DOUBLE, float(p.value))
             if p.type_ == Parameter.Type.INTEGER and p.name in DECLARED
             and isinstance(DECLARED[p.name].default, float) else p for p in parameters]
 
 
 def _descriptor(declaration: Declaration) -> ParameterDescriptor:
-    """Return what ROS tools show of an option."""
+    """Return the descriptor of an option, which ROS tools show."""
     unit = f' [{declaration.unit}]' if declaration.unit else ''
     descriptor = ParameterDescriptor(description=declaration.description + unit)
     if declaration.choices:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recorder: the session of a node that goes on working when the disk does not."""
+"""Recorder: records the node's session; the node goes on working when the disk fails."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from dlo_calibration.ros.report_writer import ReportWriter
 
 class Recorder:
     """
-    Records one session after the other; no method raises because of the disk.
+    Records one session after the other; a failing disk makes no method raise.
 
-    :param on_failure: called with a text, once, when a session cannot be written further.
+    :param on_failure: called once, with the reason, when a session can no longer be written.
     :param make_simulator: for the report of a result.
     """
 
@@ -35,11 +35,11 @@ class Recorder:
 
     @property
     def folder(self) -> Path | None:
-        """Where the session is recorded; None where it is not."""
+        """Folder of the session that is being recorded; None if there is none."""
         return None if self._session is None else self._session.path
 
     def begin(self, options: Options) -> None:
-        """Begin a session in a new folder, if `options` say so."""
+        """Begin a session in a new folder, if the option `record` is set."""
         if options.record:
             name = time.strftime('dlo_session_%Y%m%d_%H%M%S')
             try:
@@ -48,11 +48,11 @@ class Recorder:
                 self._on_failure(str(error))
 
     def message(self, topic: str, kind: str, octets: bytes) -> None:
-        """Record a message: CDR `octets` of the type `kind`, as it came or went now."""
+        """Record a message that was received or sent just now: CDR `octets` of the type `kind`."""
         self._write(lambda session: session.write(topic, kind, octets, time.time_ns()))
 
     def start(self, options: Options) -> None:
-        """Record that a calibration with `options` begins, of what was recorded so far."""
+        """Record that a calibration with `options` starts, on the messages recorded so far."""
         self._write(lambda session: session.write_options(options.flat()))
         self._write(lambda session: session.write_mark('start'))
 
@@ -60,7 +60,7 @@ class Recorder:
         """
         Write result.xml and evaluations.csv (result_2.xml, ...) into the session's folder.
 
-        report.html (report_2.html, ...) follows, some seconds later.
+        report.html (report_2.html, ...) follows some seconds later.
         """
         if self._session is not None:
             folder = self._session.path
@@ -76,7 +76,7 @@ class Recorder:
                                  result, origin)
 
     def tell(self) -> None:
-        """Tell why a report could not be written, if one could not since the last time."""
+        """Call `on_failure` for each report that could not be written since the last call."""
         for text in self._reporter.failures():
             self._on_failure(text)
 
@@ -96,7 +96,7 @@ class Recorder:
         try:
             write(self._session)
         except RecordingError as error:
-            self._session = None  # before the report, which is a message to record
+            self._session = None  # first, as on_failure sends a message, which would be recorded
             self._on_failure(str(error))
 
 

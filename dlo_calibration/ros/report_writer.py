@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""ReportWriter: writes the page of a result in a thread of its own, as it takes seconds."""
+"""ReportWriter: writes the page of a result in a thread of its own, because that takes seconds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.report.page import Origin, write_report
 
-PATIENCE = 10.0  # s that the end waits for a page
-
 
 class ReportWriter:
     """
-    Writes pages; nothing that goes wrong there is raised.
+    Writes pages; it collects errors instead of raising them.
 
     :param make_simulator: called in the thread, for the slices.
     """
@@ -39,19 +37,19 @@ class ReportWriter:
         thread.start()
 
     def failures(self) -> Iterator[str]:
-        """Take what went wrong since the last time, as sentences."""
+        """Yield a sentence for each page that could not be written since the last call."""
         while not self._failures.empty():
             yield self._failures.get_nowait()
 
     def close(self) -> None:
-        """Simulate no further; wait until the pages are written, or for a while at least."""
+        """End the simulations, and wait until the pages are written, at most 10 s for each."""
         self._stop.set()
         for thread in self._threads:
-            thread.join(PATIENCE)
+            thread.join(10.0)
 
     def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
         try:
             slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
             write_report(path, result, origin, slices)
-        except Exception as error:  # a thread that dies silently leaves the user without a page and a reason
+        except Exception as error:  # the user must learn why there is no page
             self._failures.put(f'the report could not be written: {" ".join(str(error).split()) or error!r}')

@@ -4,8 +4,8 @@
 """
 CalibrationSession: what the node knows, and what it does with a message, a request or the passing of time.
 
-It imports no rclpy: what it needs of the graph is a `Graph`, which the node is.
-Whatever goes wrong ends in the log and in ``~/status``, and the node stays.
+It imports no rclpy: it reaches ROS through a `Graph`, which the node implements.
+Every error is reported in the log and in ``~/status``, and the node goes on working.
 """
 
 from __future__ import annotations
@@ -32,18 +32,13 @@ from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.markers import markers
 from dlo_calibration.ros.recorder import Recorder
 
-PROGRESS_PERIOD = 0.1  # s between two progress messages, at least
-MARKERS_PERIOD = 1.0  # s between two messages of markers while trials come in, at least
-MARKERS_SHARE = 0.1  # s more of it per trial, so that a long session is not recorded again and again
-STREAM_PERIOD = 2.0  # s between two looks at what trials tell, while messages keep coming
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
-PATIENCE = 10.0  # s that the end waits for the worker
-WAIT = 'wait for it, or call ~/stop first'
-DEFECT = 'this is a defect of dlo_calibration, please report it'
+PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
+DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
 
 
 class Graph(Protocol):
-    """What a session needs of the node that it belongs to."""
+    """What a session needs from its node."""
 
     def options(self) -> Options:
         """Return the options in force."""
@@ -55,7 +50,7 @@ class Graph(Protocol):
         """Return the full name of one of the node's topics."""
 
     def decode(self, kind: str, octets: bytes) -> Any:
-        """Return the message that came on an input topic; raise anything where the bytes are damaged."""
+        """Return the message that came on an input topic; damaged bytes may raise any exception."""
 
     def encode(self, name: str, message: Any) -> bytes:
         """Return the CDR bytes of a message for an output topic."""
@@ -64,7 +59,7 @@ class Graph(Protocol):
         """Publish bytes on an output topic."""
 
     def hear_waiting(self) -> None:
-        """Pass on the messages that wait in the queues of the input topics."""
+        """Pass the messages in the queues of the input topics to the session."""
 
     def info(self, text: str) -> None:
         """Log a text."""
@@ -81,7 +76,7 @@ class _Calibration:
     """
     A calibration under way.
 
-    :param sent: when its progress was sent last [s].
+    :param sent: time of its last progress message [s].
     """
 
     options: Options
@@ -92,10 +87,10 @@ class _Calibration:
 @dataclass
 class _Pace:
     """
-    Something that is done again where there is a reason, but not too often.
+    When to repeat something that is repeated if needed, but not too often.
 
-    :param wanted: there is a reason.
-    :param last: when it was done last [s].
+    :param wanted: whether it is needed.
+    :param last: time when it was done last [s].
     """
 
     wanted: bool = False
@@ -105,21 +100,21 @@ class _Pace:
 @dataclass
 class _Memory:
     """
-    What a reset forgets, beside the trials.
+    What a reset forgets, besides the trials.
 
-    :param detail: of the state, e.g. why it failed.
-    :param told: refusals that the user knows.
-    :param heard: when the last action or goal chain came [s].
-    :param started: a calibration was started, so that none need start by itself.
+    :param detail: about the state, e.g. why the calibration failed.
+    :param refusals: the latest ones, which are not reported again.
+    :param heard: time of the last action or goal chain [s].
+    :param started: whether a calibration was started, so that `start_after_trials` starts none.
     :param status: content of the last ``~/status``.
     :param result: of the last calibration.
-    :param information: what the newest trial tells that was appraised.
+    :param information: about the newest trial that was appraised.
     """
 
     state: str = 'collecting'
     detail: str = ''
     last_refusal: str = ''
-    told: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
+    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
     heard: float = float('-inf')
     started: bool = False
     status: dict[str, Any] = field(default_factory=dict)
@@ -131,13 +126,13 @@ class _Memory:
 
 class CalibrationSession:
     """
-    Collects trials, calibrates on request, and publishes what there is to say of it.
+    Collects trials, calibrates on request, and publishes progress, result, status and markers.
 
-    Not to be shared between threads.
+    It is not thread-safe.
 
     :param types: the message classes that `graph` encodes.
     :param make_simulator: builds the engine, in the worker's thread.
-    :param clock: gives seconds that never go back.
+    :param clock: a monotonic clock [s].
     """
 
     def __init__(self, graph: Graph, types: MessageTypes, make_simulator: SimulatorFactory,
@@ -177,7 +172,7 @@ class CalibrationSession:
                 self.refuse(str(refusal))
         except InputError as error:
             self.refuse(str(error))
-        except Exception as error:  # a defect of ours must not take the session with it
+        except Exception as error:  # a defect of this package must not end the session
             self.refuse(f'{kind}: could not be used ({error!r}); {DEFECT}')
         else:
             if not self.calibrating:
@@ -186,12 +181,12 @@ class CalibrationSession:
     def refuse(self, text: str) -> None:
         """Tell why something was refused, in the log and in ``~/status``."""
         self._memory.last_refusal = text
-        self._memory.told.append(text)
+        self._memory.refusals.append(text)
         self._graph.warn(text)
         self._report()
 
     def request(self, name: str) -> tuple[bool, str]:
-        """Do what the service `start`, `stop` or `reset` asks for; return whether it did, and an answer."""
+        """Serve a request `start`, `stop` or `reset`; return whether that succeeded, and the answer."""
         try:
             answer = {'start': self._start, 'stop': self._stop, 'reset': self._reset}[name]()
         except Exception as error:
@@ -202,59 +197,63 @@ class CalibrationSession:
         return True, answer
 
     def tick(self) -> None:
-        """Do what is due by now; to be called many times a second."""
+        """Do what is due now; the node calls this many times a second."""
         self._take_events()
         self._recorder.tell()
         self._start_by_itself()
         self._appraise()
-        period = MARKERS_PERIOD + MARKERS_SHARE * self._collector.count
+        # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
+        period = 1.0 + 0.1 * self._collector.count
         if self._memory.markers.wanted and self._collector.count \
                 and self._clock() - self._memory.markers.last >= period:
             self._show()
         self._report()
 
     def fail(self, text: str, *log: str) -> None:
-        """Tell in ``~/status`` that something failed, and in the log, in the words of `log` if given."""
+        """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
         self._memory.state, self._memory.detail = 'failed', text
         for line in log or (text,):
             self._graph.error(line)
         self._report()
 
     def close(self) -> None:
-        """End the calibration, whose best so far is the result, and the recording."""
+        """End the calibration, with its best evaluation so far as the result, then the recording."""
         self._worker.stop()
         self._appraiser.stop()
         try:
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
-                self._graph.warn('the simulation under way does not end; it is left behind')
+                self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
         finally:
             self._recorder.close()
 
     # Requests
 
-    def _start(self) -> str:
+    def _require_idle(self, service: str) -> None:
         if self.calibrating:
-            raise InputError('~/start', 'a calibration under way', 'none', WAIT)
-        self._graph.hear_waiting()  # sent before the request, so it belongs to it
+            raise InputError(service, 'a calibration under way', 'none', 'wait for it, or call ~/stop first')
+
+    def _start(self) -> str:
+        self._require_idle('~/start')
+        self._graph.hear_waiting()  # messages sent before the request belong to this calibration
         options = self._graph.options()
         if options != self._collected_with:
             self._collector, self._collected_with = self._collector.with_options(options), options
-        told = set(self._memory.told)
+        known = set(self._memory.refusals)
         for problem in self._collector.problems:
-            if str(problem) not in told:
+            if str(problem) not in known:
                 self.refuse(str(problem))
         trials = self._collector.trials
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
-        self._make_simulator(options).close()  # refuses an engine or a scene that cannot be had
+        self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         self._recorder.start(options)
         self._calibration = _Calibration(options, Progress(options.evaluations, len(trials)))
         memory = self._memory
         memory.started, memory.state, memory.detail = True, 'calibrating', ''
         self._appraiser.stop()
-        memory.appraisal.wanted = True  # what a calibration without a result leaves open
+        memory.appraisal.wanted = True  # again after the calibration, as this one was stopped
         self._worker.start(trials, options)
         return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
 
@@ -262,7 +261,7 @@ class CalibrationSession:
         memory, wanted = self._memory, self._graph.options().start_after_trials
         if self.calibrating or memory.started or not 0 < wanted <= self._collector.count:
             return
-        # A trial may have many goal chains; it is complete when the next one began, or nothing follows.
+        # A trial may have many goal chains: it is complete when the next trial begins, or no message follows.
         if self._collector.count > wanted or self._clock() - memory.heard > QUIET:
             memory.started = True
             try:
@@ -278,8 +277,7 @@ class CalibrationSession:
         return 'the search ends now; the best so far will be the result'
 
     def _reset(self) -> str:
-        if self.calibrating:
-            raise InputError('~/reset', 'a calibration under way', 'none', WAIT)
+        self._require_idle('~/reset')
         self._recorder.end()
         self._appraiser.stop()
         self._collected_with = self._graph.options()
@@ -289,7 +287,7 @@ class CalibrationSession:
         self._show()
         return 'the trials are forgotten'
 
-    # Events of the worker, and what trials tell
+    # Events of the worker, and appraisals of trials
 
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():
@@ -300,7 +298,8 @@ class CalibrationSession:
                 self._finish(event)
             elif self._calibration is not None:
                 self._calibration.progress.take(event)
-        if self._calibration is not None and self._clock() - self._calibration.sent >= PROGRESS_PERIOD:
+        # At most ten progress messages a second: nobody reads faster, and each is recorded.
+        if self._calibration is not None and self._clock() - self._calibration.sent >= 0.1:
             self._send_progress(self._calibration)
 
     def _finish(self, event: CalibrationResult | Failure) -> None:
@@ -326,20 +325,21 @@ class CalibrationSession:
         self._report()
 
     def _appraise(self) -> None:
-        """Take what trials turned out to tell; have new ones appraised, unless a calibration is under way."""
+        """Take finished appraisals; start one if trials changed and no calibration is under way."""
         memory, now = self._memory, self._clock()
-        for told in self._appraiser.waiting_information():
-            memory.information = told
+        for information in self._appraiser.waiting_information():
+            memory.information = information
         quiet = now - memory.heard > QUIET
+        # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
         if memory.appraisal.wanted and not self.calibrating and self._collector.count \
-                and not self._appraiser.alive and (quiet or now - memory.appraisal.last > STREAM_PERIOD):
+                and not self._appraiser.alive and (quiet or now - memory.appraisal.last > 2.0):
             memory.appraisal = _Pace(wanted=not quiet, last=now)
             self._appraiser.start(self._collector.trials, self._graph.options(), memory.result, whole=quiet)
 
-    # What is told
+    # Messages of the node
 
     def _send_progress(self, calibration: _Calibration) -> None:
-        """Send the newest evaluation, if it was not sent yet."""
+        """Send the newest evaluation, unless it has been sent."""
         progress = calibration.progress
         if progress.newest is None or progress.best is None:
             return
@@ -350,11 +350,12 @@ class CalibrationSession:
         progress.newest, calibration.sent = None, self._clock()
 
     def _report(self) -> None:
-        """Send the status, where it differs from the last one."""
+        """Send the status if it differs from the last one."""
         memory = self._memory
         content: dict[str, Any] = {
             'state': memory.state, 'trials': self._collector.count, 'last_refusal': memory.last_refusal,
-            'incomplete': self._collector.incomplete, 'detail': memory.detail, 'told': memory.information}
+            'incomplete': self._collector.incomplete, 'detail': memory.detail,
+            'information': memory.information}
         if content != memory.status:
             memory.status = content
             self._send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))
@@ -367,7 +368,7 @@ class CalibrationSession:
 
     def _send(self, name: str, message: Any) -> None:
         octets = self._graph.encode(name, message)
-        # First: what anybody heard is on the disk.
+        # Recorded first, so that every message that a subscriber received is on the disk.
         self._recorder.message(self._graph.topic(name), OUTPUT_TYPES[name], octets)
         self._graph.publish(name, octets)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from result_message import result_values
 from wire import wire
 
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
@@ -44,7 +45,7 @@ def by_name(message):
 def test_result_tells_every_parameter_exactly(types):
     found = found_result()
     message = diagnostics.result(types, found, STAMP)
-    values = diagnostics.result_values(message)
+    values = result_values(message)
     assert list(values) == ['flexibility', 'friction']
     for name, estimate in found.parameters.items():
         assert list(values[name]) == [
@@ -105,7 +106,8 @@ def test_status_tells_state_trials_and_refusal(types, state, level):
 
 def test_status_tells_what_the_newest_trial_tells(types):
     told = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
-    one, values = by_name(diagnostics.status(types, stamp=STAMP, state='collecting', trials=2, told=told))[
+    one, values = by_name(diagnostics.status(
+        types, stamp=STAMP, state='collecting', trials=2, information=told))[
         'status']
     assert values['last_trial'] == told.words
     assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
@@ -114,7 +116,7 @@ def test_status_tells_what_the_newest_trial_tells(types):
     assert one.message == f'collecting; {told.words}'
     failed, values = by_name(diagnostics.status(
         types, stamp=STAMP, state='failed', trials=2, detail='why',
-        told=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
+        information=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
     assert values['last_trial'] == 'what trial 2 tells is not known: it diverged'
     assert not any(key.startswith('std_') for key in values)
     assert failed.message == 'failed: why'
@@ -127,7 +129,7 @@ def test_status_knows_four_states(types):
 
 def test_diagnostics_cross_the_wire(types):
     travel = wire(types)
-    values = diagnostics.result_values(travel(diagnostics.result(types, found_result(), STAMP)))
+    values = result_values(travel(diagnostics.result(types, found_result(), STAMP)))
     assert values['flexibility']['value'] == 100 / 3
     report = travel(diagnostics.status(types, stamp=STAMP, state='failed', trials=0, detail='why'))
     assert report.status[0].level == types.level(2)

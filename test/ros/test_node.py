@@ -19,6 +19,7 @@ from processes import children
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
+from result_message import result_values
 from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
@@ -29,7 +30,7 @@ from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.ros.calibrator_node import CalibratorNode
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from collections import defaultdict
 import time
 
 import pytest
+from result_message import result_values
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
 
@@ -17,7 +18,7 @@ from dlo_calibration.files.recording import typestore
 from dlo_calibration.files.result import read_description
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INITIAL, INPUT_TYPES
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, result_values
+from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.session import CalibrationSession
 
 pytestmark = pytest.mark.usefixtures('without_drawings')
