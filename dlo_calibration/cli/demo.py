@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo: the real node, a sample session sent to it over the graph, a result and a picture.
+The demo: sends a sample session to the real node over the ROS graph, and shows the result.
 
-`python -m dlo_calibration.cli.demo [--output DIR]`; this process stands for the robot.
+`python -m dlo_calibration.cli.demo [--output DIR]`; this process plays the robot.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.signals import StopFlag
 
-NODE = '/calibrator'
-EVALUATIONS = 100
-LAST_DOMAIN = 101  # above it, the ports of a ROS domain may be anybody's
-PATIENCE = 60.0  # s without any sign of life from the node
-PICTURE, LOG = 'demo.png', 'calibrator.log'
+NODE = '/calibrator'  # its full name, the namespace of its topics
+LAST_DOMAIN = 101  # of ROS, up to which no port lies in the operating system's ephemeral range
+PATIENCE = 60.0  # s without a message from the node, after which the demo gives up
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo; return 0, or 1 with one line on stderr where something did not work."""
+    """Run the demo; return 0; 1, with one line on stderr, if something did not work; 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(prog='demo', description='Calibrate a sample with the real node.')
-    parser.add_argument('--output', type=Path, default=Path('demo_output'), help='folder to write to')
-    parser.add_argument('--sample', type=Path, help='session to send; default: object1 of msg_samples')
-    parser.add_argument('--evaluations', type=int, default=EVALUATIONS)
+    parser.add_argument('--output', type=Path, default=Path('demo_output'),
+                        help='folder to write to (default: %(default)s)')
+    parser.add_argument('--sample', type=Path, help='session to send (default: object1 of msg_samples)')
+    parser.add_argument('--evaluations', type=int, default=100,
+                        help='largest number of parameter sets to try (default: %(default)s)')
     chosen = parser.parse_args(args)
     stop = StopFlag()
     stop.listen()
@@ -67,8 +67,8 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
     before = set(output.glob('dlo_session_*'))
     options = {**(session.recorded or {}), 'evaluations': evaluations,
                'output_directory': str(output.resolve())}
-    out = terminal.console(sys.stdout)
-    with _node(options, output / LOG) as child, _robot(child, output / LOG, stop) as robot:
+    out, log, picture = terminal.console(sys.stdout), output / 'calibrator.log', output / 'demo.png'
+    with _node(options, log) as child, _robot(child, log, stop) as robot:
         out.print(f'sending {sample.name} to the node {NODE} ...')
         robot.send(session)
         expected = len(session_trials(session, Options.of({**Options().flat(), **options}))[0])
@@ -81,16 +81,16 @@ def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]
     file = read_result(folder / 'result.xml')
     used = Options.of(file.options)
     result = validated(file, session_trials(read_session(folder), used)[0], used)
-    session_picture(result.trials, result.chains, output / PICTURE)
+    session_picture(result.trials, result.chains, picture)
     terminal.print_result(result, sys.stdout, {key: getattr(file, key) for key in HOW})
     out.print(f'session and result.xml: {folder}', soft_wrap=True)
-    out.print(f'simulated chains on the measured ones: {output / PICTURE}', soft_wrap=True)
+    out.print(f'picture of measured and simulated chains: {picture}', soft_wrap=True)
 
 
 def _show(robot: Any, bar: terminal.SearchBar) -> bool:
-    """Move the progress bar; return whether the result is there."""
+    """Move the progress bar; return whether the result has arrived."""
     if robot.value('status', 'state') == 'failed':
-        raise DloCalibrationError(f'the node says: {robot.value("status", "detail")}')
+        raise DloCalibrationError(f'the node reports: {robot.value("status", "detail")}')
     if robot.value('progress', 'evaluation'):
         bar.move(int(robot.value('progress', 'evaluation')), float(robot.value('progress', 'best_score')))
     return 'result' in robot.heard
@@ -98,10 +98,10 @@ def _show(robot: Any, bar: terminal.SearchBar) -> bool:
 
 @contextmanager
 def _node(options: dict[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Start the node as a process of its own, and end it as Ctrl-C would."""
+    """Start the node in a process of its own, and end it as Ctrl-C would."""
     command = [sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args']
     for name, value in options.items():
-        command += ['-p', f'{name}:={json.dumps(value)}']  # JSON is YAML, which ROS expects
+        command += ['-p', f'{name}:={json.dumps(value)}']  # ROS expects YAML, and JSON is valid YAML
     with log.open('wb') as stream:
         child = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
         try:
@@ -138,7 +138,7 @@ def _robot(child: subprocess.Popen[bytes], log: Path, stop: Callable[[], bool]) 
 
 
 class _Robot:
-    """What robot software does: send, call, listen."""
+    """The robot's software: sends messages, calls services, and keeps the last message of each topic."""
 
     def __init__(self, node: Any, child: subprocess.Popen[bytes], log: Path,
                  stop: Callable[[], bool]) -> None:
@@ -159,13 +159,13 @@ class _Robot:
         self._client = node.create_client(Trigger, f'{NODE}/start')
 
     def value(self, topic: str, key: str) -> str:
-        """Return a value of the first status in the last message of a topic; empty where there is none."""
+        """Return a value of the first status in the last message of a topic; empty if there is none."""
         if topic not in self.heard:
             return ''
         return str(next((pair.value for pair in self.heard[topic].status[0].values if pair.key == key), ''))
 
     def wait(self, ready: Callable[[], bool], what: str) -> None:
-        """Listen until `ready`; give up where nothing is heard for long."""
+        """Listen until `ready` returns true; raise DloCalibrationError after PATIENCE without a message."""
         import rclpy
 
         last, quiet_since = dict(self.heard), time.monotonic()
@@ -194,7 +194,7 @@ class _Robot:
         self.wait(future.done, 'the answer of ~/start')
         answer = future.result()
         if not answer.success:
-            raise DloCalibrationError(f'the node says: {answer.message}')
+            raise DloCalibrationError(f'the node refuses: {answer.message}')
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verb `experiment`: repeats the paper's experiment, and prints its tables."""
+"""The verb `experiment`: repeats the experiment of the paper, and prints its tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import MACHINE, names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.cli.output import INTERRUPTED, print_json, tell
-from dlo_calibration.cli.source import read_source
+from dlo_calibration.cli.source import add_common_arguments, read_source
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.conduct import conduct, Plan
@@ -24,41 +24,39 @@ from dlo_calibration.files.samples import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.signals import StopFlag
 
-TEXT = "repeat the paper's experiment: how consistent found parameters are, and how valid"
-PAPER_RUNS, PAPER_SEARCH = 20, 'random'
-#: Options that are not taken from what was recorded, so that all objects are searched alike.
+TEXT = "repeat the paper's experiment, which measures how consistent and how valid the found parameters are"
+#: Options that are not taken from the recordings, so that they are the same for all objects.
 SAME_FOR_ALL = ('search', 'evaluations', 'seed', *names_of(MACHINE))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what the verb understands."""
+    """Add the arguments of the verb."""
     parser.add_argument('sessions', metavar='SESSION', type=Path, nargs='*',
-                        help='one of each object; default: the five samples of the package')
-    parser.add_argument('--runs', metavar='N', type=int, default=PAPER_RUNS,
-                        help='calibrations of each object with each search, with one seed after the other '
-                             f'(default: {PAPER_RUNS})')
+                        help='one session per object (default: the five samples of the package)')
+    parser.add_argument('--runs', metavar='N', type=int, default=20,
+                        help='calibrations of each object with each search, each with its own seed '
+                             '(default: %(default)s, as in the paper)')
     default = Options().search
-    parser.add_argument('--search', metavar='NAME', nargs='+', default=[PAPER_SEARCH, default],
+    parser.add_argument('--search', metavar='NAME', nargs='+', default=['random', default],
                         help=f'one or more of {", ".join(SEARCHES)} '
-                             f"(default: {PAPER_SEARCH}, which is the paper's, and {default})")
+                             f'(default: random, as in the paper, and {default})')
     judged = parser.add_mutually_exclusive_group()
     judged.add_argument('--held-back', metavar='K', type=int, nargs='+',
-                        help='numbers of the trials that are left out in turn and simulated with what the '
-                             'others gave (default: all)')
+                        help='numbers of the trials to cross-validate with: each is left out in turn, and '
+                             'simulated with the parameters that the others give (default: all)')
     judged.add_argument('--validate-on', metavar='SESSION', type=Path, nargs='+',
-                        help='simulate the trials of these with what the sessions gave, one for each '
-                             'SESSION; nothing is left out then')
+                        help='leave no trial out, but simulate the trials of these sessions with the '
+                             'parameters found; one for each SESSION that is calibrated on')
     parser.add_argument('--output', metavar='DIR', type=Path, default=Path('experiment_output'),
-                        help='folder of all files; what is found done there is not done again '
-                             '(default: experiment_output)')
-    parser.add_argument('--namespace', help='of the topics, where a session holds several')
-    parser.add_argument('--json', action='store_true', help='print one JSON document')
-    # A flag of its own is in place of `search`; of the machine's options, only the processes count here.
+                        help='folder for all files; calibrations that it has already are not repeated '
+                             '(default: %(default)s)')
+    add_common_arguments(parser)
+    # `--search` is declared above; of the machine's options, only `workers` has an effect here.
     add_options(parser, without=['search', *(name for name in names_of(MACHINE) if name != 'workers')])
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    """Do what the verb says; return the exit code."""
+    """Execute the verb; return the exit code."""
     plan = _plan(chosen)
     with StopFlag() as stop:
         account = conduct(plan, chosen.output, make_simulator, stop, tell, sys.stderr)
@@ -73,9 +71,9 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 def _plan(chosen: argparse.Namespace) -> Plan:
     """
-    Return what a command line asks for.
+    Return the experiment that a command line asks for.
 
-    :raises InputError: where that cannot be done.
+    :raises InputError: if sessions, trial numbers or searches cannot be used.
     """
     searches = tuple(dict.fromkeys(name for word in chosen.search for name in word.split(',') if name))
     for name in searches:
@@ -98,7 +96,7 @@ def _plan(chosen: argparse.Namespace) -> Plan:
 
 
 def _observed(chosen: argparse.Namespace, path: Path, of_result: Mapping[str, Any] | None = None) -> Observed:
-    """Return what is in a session, with the options to use on it."""
+    """Return the trials of a session, with the options to use on them."""
     source = read_source(chosen, lambda text: tell(f'{path}: {text}'), of_result, path).require_trials()
     same = {**Options().flat(), **given_options(chosen)}
     return Observed(source.trials, Options.of({**source.options.flat(),
@@ -118,7 +116,7 @@ def _command(chosen: argparse.Namespace, searches: Sequence[str]) -> str:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Name the objects after their sessions; one whose name is taken gets a number."""
+    """Name the objects after their sessions; a name that is taken gets a number."""
     names = [path.stem if path.suffix in ('.mcap', '.db3', '.xml') else path.resolve().name
              for path in paths]
     return [name if name not in names[:k] else f'{name}_{names[:k].count(name) + 1}'

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verb `fit`: finds the parameter set that explains a session, and writes it down."""
+"""The verb `fit`: finds the parameters that explain a session best, and writes the result."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.cli.options import given_options
 from dlo_calibration.cli.output import print_result, tell
 from dlo_calibration.cli.source import add_source, read_source, Source
-from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.errors import SimulationError, unwritable
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.files.session import trial_records
 from dlo_calibration.signals import StopFlag
 
-TEXT = 'find the parameter set that explains a session'
+TEXT = 'find the parameters that explain a session best'
+# Names of the files in the output folder.
 RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
 REQUEST = 'request.xml'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what the verb understands."""
+    """Add the arguments of the verb."""
     add_source(parser)
     parser.add_argument('--output', metavar='DIR', type=Path,
-                        help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} there')
+                        help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} to this folder')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    """Do what the verb says; return the exit code."""
+    """Execute the verb; return the exit code."""
     from dlo_calibration.report.terminal import SearchBar
 
     source = read_source(chosen, tell).require_trials()
@@ -69,26 +70,25 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             if folder is not None:
                 _write_files(folder, source, result, make_simulator, stop)
                 tell(f'{", ".join(files)} are in {folder}')
-        finally:  # a disk that is full by now must not lose what was found
+        finally:  # print the result even if the disk is full
             print_result(result, chosen.json, told)
     return 0
 
 
 def _make_folder(folder: Path, names: Sequence[str]) -> None:
-    """Make a folder in which files of these names can be written, before hours are spent on a search."""
+    """Make the folder, and check that these files can be written, before hours are spent on a search."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in names:
             with (folder / name).open('ab'):
                 pass
     except OSError as error:
-        raise InputError(f'folder {folder}', str(error), 'a folder that can be written to',
-                         'choose another one with --output') from error
+        raise unwritable(folder, error, 'folder') from error
 
 
 def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,
                  should_stop: Callable[[], bool]) -> None:
-    """Write a result, and what it was found from, into a folder."""
+    """Write a result, and the session or request that it was found from, to a folder."""
     from dlo_calibration.report.page import digests, Origin, repeating_command, write_report
 
     write_result(folder / RESULT, result, source.options.flat())
@@ -112,9 +112,9 @@ def _recorded(path: Path) -> list[Path]:
 
 def _write_session(path: Path, source: Source) -> None:
     """
-    Copy a session into one MCAP file; one that is already such a file, byte by byte.
+    Write a session as one MCAP file; if it is one already, copy the file.
 
-    Of a request, the messages are written that a robot would have sent.
+    For a request, write the messages that a robot would have sent.
     """
     files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
     try:
@@ -131,8 +131,7 @@ def _write_session(path: Path, source: Source) -> None:
         writer.file.replace(path)
         shutil.rmtree(writer.path)
     except OSError as error:
-        raise InputError(f'file {path}', str(error), 'a place that can be written to',
-                         'choose another one with --output') from error
+        raise unwritable(path, error) from error
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verb `info`: says what is in a session."""
+"""The verb `info`: shows what a session contains."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dlo_calibration.cli.output import print_json
 from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.model.trial import Trial
 
-TEXT = 'say what is in a session'
+TEXT = 'show what a session contains'
 add_arguments = add_source
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    """Do what the verb says; return the exit code."""
+    """Execute the verb; return the exit code."""
     from dlo_calibration.report import terminal
 
     about = _about(read_source(chosen, lambda text: None))
@@ -32,7 +32,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 
 def _about(source: Source) -> dict[str, Any]:
-    """Return what is in a session."""
+    """Return what a session contains, as plain values."""
     records = source.session.records
     frames = sorted({message.header.frame_id for _, message in source.session.messages})
     duration = (records[-1].log_time - records[0].log_time) / 1e9 if records else 0.0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: what the node does, from a recorded session."""
+"""The command line `dlo-calibration`: calibrates from recorded sessions, without ROS."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from dlo_calibration.cli import experiment, fit, info, plot, validate
 from dlo_calibration.cli.output import INTERRUPTED
 from dlo_calibration.errors import DloCalibrationError
 
-PROGRAM = 'dlo-calibration'
+PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 #: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
 VERBS = {'fit': fit, 'validate': validate, 'info': info, 'plot': plot, 'experiment': experiment}
 
 
 def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
     """
-    Do what a command line says.
+    Execute a command line.
 
-    :param args: without the program's name; None: that of the process.
-    :returns: exit code: 0; 2 for what cannot be used, after one line on stderr; 130 where
-        Ctrl-C came before there was anything to report, or before an experiment was complete.
+    :param args: command line without the program's name; None: that of the process.
+    :returns: exit code: 0; 2, with one line on stderr, if an input cannot be used; 130 if Ctrl-C
+        arrived before there was anything to report, or before an experiment was complete.
     """
     try:
         chosen = _parser().parse_args(args)
@@ -38,13 +38,13 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
     except KeyboardInterrupt:
         sys.stderr.write(f'{PROGRAM}: interrupted\n')
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of a pipe has seen enough
+    except BrokenPipeError:  # the reader of the pipe, such as `head`, has ended
         sys.stderr.close()
         return 0
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors take one line."""
+    """A parser that reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'{self.prog}: {" ".join(message.split())}; see {self.prog} --help\n')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Options as flags: one for each declared option, and which of them a command line gives."""
+"""Options as flags: adds a flag for each declared option, and reads those that a command line gives."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any, Sequence
 
 from dlo_calibration.calibration.options import Declaration, declarations
 
-PREFIX = 'option_'  # of the attributes of parsed words that hold an option
+PREFIX = 'option_'  # tells options from the other attributes of a parsed command line
 
 
 def add_options(parser: argparse.ArgumentParser, without: Sequence[str] = ()) -> None:
-    """Add a flag for every option; what is not given is absent from the parsed ones."""
+    """Add a flag for every option except those in `without`; flags that are not given have no attribute."""
     group = parser.add_argument_group('options of the calibrator (default: as the session was recorded)')
     for declaration in (one for one in declarations() if one.name not in without):
         names = dict.fromkeys((f'--{declaration.name.replace("_", "-")}', f'--{declaration.name}'))
@@ -31,7 +31,7 @@ def given_options(chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def _flag(declaration: Declaration) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for an option."""
+    """Return the keyword arguments of `add_argument` for an option."""
     default = ' '.join(declaration.default) if isinstance(declaration.default, tuple) else declaration.default
     unit = f' [{declaration.unit}]' if declaration.unit else ''
     text = f'{declaration.description}{unit}; default {default}'.replace('%', '%%')

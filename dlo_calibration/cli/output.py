@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Output: what verbs print, JSON or a table on stdout, and everything else on stderr."""
+"""Output: verbs print JSON or tables on stdout, and everything else on stderr."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, by the shells' co
 
 
 def tell(text: str) -> None:
-    """Tell the user something, in a line on stderr."""
+    """Print a line on stderr."""
     sys.stderr.write(f'{text}\n')
 
 
 def print_json(value: Mapping[str, Any], stream: TextIO) -> None:
-    """Print one JSON document, in which null stands for a number that is not finite."""
+    """Print one JSON document, with null for numbers that are not finite."""
     json.dump(known(value), stream, indent=2, allow_nan=False)
     stream.write('\n')
     stream.flush()
@@ -31,7 +31,7 @@ def print_result(result: CalibrationResult, as_json: bool, told: Sequence[str] =
     """
     Print a result on stdout, and its warnings on stderr.
 
-    :param told: warnings that the user has seen already.
+    :param told: warnings that have been printed already.
     """
     from dlo_calibration.report import terminal
 

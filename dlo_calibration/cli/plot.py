@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verb `plot`: draws each trial, as measured, and as simulated with a result."""
+"""The verb `plot`: draws each trial as measured, and as simulated with a result."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 
-TEXT = 'draw a picture of each trial: measured, and simulated with a result'
+TEXT = 'draw a picture of each trial, as measured and as simulated with a result'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what the verb understands."""
+    """Add the arguments of the verb."""
     add_source(parser)
     parser.add_argument('result', metavar='RESULT.xml', type=Path, nargs='?',
-                        help='simulate with its parameters; without it, only what was measured is drawn')
+                        help='simulate with the parameters of this result (default: draw only measurements)')
     parser.add_argument('--output', metavar='DIR', type=Path, default=Path(),
-                        help='write trial_1.png, ... there; default: the current folder')
+                        help='write trial_1.png, ... to this folder (default: the current one)')
     parser.add_argument('--animation', action='store_true',
-                        help='also write trial_1.gif, ...: how the simulated DLO moves')
+                        help='also write trial_1.gif, ..., which show how the simulated DLO moves')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    """Do what the verb says; return the exit code."""
+    """Execute the verb; return the exit code."""
     from dlo_calibration.report.animation import write_animations
     from dlo_calibration.report.drawing import write_pictures
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Source: what a verb works on, a recorded session or an XML request, with its options and trials."""
+"""Source: the input of a verb, a recorded session or an XML request, with its options and trials."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Source:
     """
     A session or a request, the options to use on it, and the trials in it.
 
-    :param session: as recorded; of a request, one without messages.
-    :param refusals: why messages are not used, one text each.
+    :param session: as recorded; for a request, a session without messages.
+    :param refusals: one text for each message that is not used, with the reason.
     """
 
     session: Session
@@ -34,34 +34,39 @@ class Source:
 
     @property
     def path(self) -> Path:
-        """Of the session or the request."""
+        """Path of the session or the request."""
         return self.session.path
 
     @property
     def is_request(self) -> bool:
-        """Tell whether it is an XML request."""
+        """Whether it is an XML request."""
         return is_request(self.path)
 
     def require_trials(self) -> Source:
         """
-        Return this source, which has a trial.
+        Return this source if it has a trial.
 
-        :raises InputError: where it has none.
+        :raises InputError: if it has none.
         """
         if not self.trials:
             raise InputError(f'session {self.path}', 'no complete trial',
                              'an initial_chain, an action and a goal_chain, in the order of their stamps',
-                             'see what is in it with dlo-calibration info')
+                             'see what it contains with dlo-calibration info')
         return self
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
-    """Add the words that name a source, and the options to use on it."""
+    """Add the arguments that name a source, and the options to use on it."""
     parser.add_argument('session', metavar='SESSION', type=Path,
                         help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
-    parser.add_argument('--namespace', help='of the topics, where the session holds several')
-    parser.add_argument('--json', action='store_true', help='print one JSON document')
+    add_common_arguments(parser)
     add_options(parser)
+
+
+def add_common_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that every verb has."""
+    parser.add_argument('--namespace', help='namespace of the topics, if a session has several')
+    parser.add_argument('--json', action='store_true', help='print one JSON document')
 
 
 def is_request(path: Path) -> bool:
@@ -72,12 +77,13 @@ def is_request(path: Path) -> bool:
 def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
                 of_result: Mapping[str, Any] | None = None, path: Path | None = None) -> Source:
     """
-    Read a session or a request, with the options recorded in it; options given as flags come first.
+    Read a session or a request, with the options recorded in it; options given as flags override them.
 
-    :param chosen: the parsed words.
-    :param note: called with what the user should know of it, one sentence each.
-    :param of_result: options of a result, which come before the recorded ones, save those of the observation.
-    :param path: of the source; None: the one that the words name.
+    :param chosen: the parsed command line.
+    :param note: called with each sentence that the user should read.
+    :param of_result: options of a result; they override the recorded ones, except those of the observation.
+    :param path: of the source; None: the one on the command line.
+    :raises InputError: if it cannot be read, or an option has a bad value.
     """
     path = chosen.session if path is None else path
     request = read_request(path) if is_request(path) else None
@@ -101,5 +107,5 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
 
 
 def _text(value: Any) -> str:
-    """Return the value of an option as a user writes it."""
+    """Return the value of an option as a user types it."""
     return ' '.join(value) if isinstance(value, list) else str(value)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The verb `validate`: simulates trials with the parameters of a result; nothing is fitted."""
+"""The verb `validate`: simulates trials with the parameters of a result, without fitting."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.trial import Trial
 
-TEXT = 'simulate a session with the parameters of a result; fit nothing'
+TEXT = 'simulate a session with the parameters of a result, without fitting'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what the verb understands."""
-    parser.add_argument('result', metavar='RESULT.xml', type=Path)
+    """Add the arguments of the verb."""
+    parser.add_argument('result', metavar='RESULT.xml', type=Path,
+                        help='simulate with the parameters of this result')
     add_source(parser)
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
-    """Do what the verb says; return the exit code."""
+    """Execute the verb; return the exit code."""
     file = read_result(chosen.result)
     source = read_source(chosen, tell, file.options).require_trials()
     result = validated(file, source.trials, source.options, make_simulator)
@@ -44,11 +45,10 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 def validated(file: Description, trials: Sequence[Trial], options: Options,
               make_simulator: SimulatorFactory = make_chosen_simulator) -> CalibrationResult:
     """
-    Simulate trials with the parameters of a result; nothing is fitted.
+    Simulate trials with the parameters of a result, without fitting.
 
-    :returns: as of a calibration that tried this parameter set only, with the
-        result's own parameters and intervals.
-    :raises SimulationError: where a trial cannot be simulated.
+    :returns: a result whose only evaluation has these parameters; values and intervals are those of `file`.
+    :raises SimulationError: if a trial cannot be simulated.
     """
     with closing(make_simulator(options)) as simulator:
         begun = time.monotonic()
