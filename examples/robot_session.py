@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A robot program that has a DLO calibrated: it sends one trial, starts the calibration, and logs the result.
+A robot program that calibrates a DLO: it sends one trial, starts the calibration, and logs the result.
 
     ros2 run dlo_calibration calibrator --ros-args -p mass:=0.03
     python3 examples/robot_session.py
@@ -22,12 +22,12 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
-FRAME = 'table'
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+FRAME = 'table'  # the same in all messages; its z axis points up
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # as the calibrator publishes
 
 
 def observed(moved):
-    """Return the points along the DLO, (n, 3) [m]; invented here: on a table, one end moved or not."""
+    """Return the points along the DLO, (n, 3) [m]; here, invented ones of a DLO on a table."""
     along = np.linspace(0, 0.6, 13)
     aside = 0.1 * np.exp(-along / 0.2) if moved else 0 * along
     return np.stack([along, aside, 0 * along + 0.004], axis=1)
@@ -40,7 +40,7 @@ def move(gripper):
 
 
 def chain(points, stamp):
-    """Return the cloud of a chain; initial and goal chain have the same material points in the same order."""
+    """Return the message of a chain; all chains of a trial have the same points in the same order."""
     cloud = PointCloud2(height=1, width=len(points), point_step=12, row_step=12 * len(points), is_dense=True)
     cloud.header.frame_id, cloud.header.stamp = FRAME, stamp.to_msg()
     cloud.fields = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Start the calibrator with its parameter file, and RViz where it is asked for.
+Start the calibrator with its parameter file, and RViz if wanted.
 
     ros2 launch dlo_calibration calibrator.launch.py rviz:=true params_file:=my_calibrator.yaml
 """
@@ -29,7 +29,7 @@ def generate_launch_description():
         DeclareLaunchArgument('frame', default_value='world',
                               description='frame_id of the chains, which RViz shows'),
         Node(package='dlo_calibration', executable='calibrator', name='calibrator', output='screen',
-             # not `parameters`, which only warns of a file that is not there
+             # `parameters` would only warn if the file is missing; this ends the node with an error
              ros_arguments=['--params-file', LaunchConfiguration('params_file')]),
         Node(package='rviz2', executable='rviz2', name='rviz2',
              arguments=['-d', str(config / 'calibrator.rviz'), '-f', LaunchConfiguration('frame')],

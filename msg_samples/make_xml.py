@@ -6,9 +6,9 @@ Write the XML documents of this folder.
 
     python msg_samples/make_xml.py [FOLDER]
 
-The trials of named_actions.xml and the result in dlo.xml are those of the session
-object1; the goal chains of the others are simulated with the parameters TRUTH.
-Coordinates are rounded to 0.1 mm.
+The trials of named_actions.xml and the result in dlo.xml come from the session object1; the
+goal chains of the other documents are simulated with the parameters TRUTH.  Coordinates are
+rounded to 0.1 mm.
 """
 
 from __future__ import annotations
@@ -39,19 +39,17 @@ from dlo_calibration.model.named_actions import (
 )
 
 HERE = Path(__file__).resolve().parent
-MASS = 0.03
-TRUTH = {'flexibility': 66.0, 'elasticity': 50.0, 'friction': 70.0, 'self_collision': 25.0}
-DIGITS = 4
-FIT = {'mass': MASS, 'evaluations': 150, 'seed': 1}
+TRUTH = {'flexibility': 66.0, 'elasticity': 50.0, 'friction': 70.0, 'self_collision': 25.0}  # 0..100
+FIT = {'mass': 0.03, 'evaluations': 150, 'seed': 1}  # options of all documents; mass in kg
 
 
 def rounded(points: np.ndarray) -> Chain:
-    """Return a chain without annotations, as it is written."""
-    return Chain(np.round(points, DIGITS))
+    """Return a chain without annotations, rounded to 0.1 mm."""
+    return Chain(np.round(points, 4))
 
 
 def named_actions(initials: Sequence[Chain]) -> list[NamedAction]:
-    """Say in words what the hands did in the four trials of object1."""
+    """Return named actions for what the hands did in the four trials of object1."""
     return [GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.09, height=0.05, speed=0.095),
             Drag(fraction=0.25, direction=(0, -1, 0), distance=0.08, speed=0.0533),
             LiftAndHold(fraction=0.5, height=0.1),
@@ -70,7 +68,7 @@ def measured() -> Request:
 
 
 def simulated(draft: TrialRequest) -> TrialRequest:
-    """Return a trial whose goal chains, one after the other, are simulated."""
+    """Return a trial with simulated goal chains; each is simulated with the chains before it."""
     options = Options.of({**FIT, 'engine': 'bullet'})
     simulator = make_simulator(options)
     for k in range(len(draft.goals)):
@@ -90,7 +88,7 @@ def straight(count: int, turn: float = 0.0) -> Chain:
 
 
 def push_and_release() -> Request:
-    """Return trials in which hands hold what others push, move apart, and open."""
+    """Return two trials: a hand holds while another pushes, then both open; two hands move apart."""
     initial = straight(13)
     held = TrialRequest(
         'push down, then release', initial,
@@ -109,7 +107,7 @@ def push_and_release() -> Request:
 
 
 def hand_paths() -> Request:
-    """Return a trial with explicit paths: a clamp that turns, and goal chains while it moves."""
+    """Return a trial with an explicit hand path: a clamp turns, and goal chains come while it moves."""
     initial = straight(13)
     half = np.sqrt(0.5)
     clamp = Hand('gripper', (0, 1), np.array([0.0, 1.0, 2.0]),

@@ -6,8 +6,8 @@ Write the first trial of a session as YAML, one file per message, for `ros2 topi
 
     python msg_samples/make_yaml.py [SESSION] [FOLDER]
 
-SESSION is object1 beside this file where none is given, FOLDER that of this file.
-Of a chain every second point is written.
+SESSION is object1 beside this file by default, and FOLDER is the folder of this file.
+Only every second point of a chain is written.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, INPUT_TYPES, NANOSECONDS, read
 
 HERE = Path(__file__).resolve().parent
-EVERY = 2
-#: Bytes of one point, of which ten thousandths of a metre are a readable rest.
+EVERY = 2  # points of a chain, so that the files stay short
+#: Layout of one point in a message.
 POINT = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('hand', 'u1')])
 
 TITLE = """\
@@ -85,7 +85,7 @@ def written(message: ChainMessage | ActionMessage) -> str:
 
 
 def written_chain(message: ChainMessage) -> str:
-    """Return what follows the header of a chain."""
+    """Return the lines after the header of a chain message."""
     points = message.chain.points[::EVERY]
     table = np.zeros(len(points), POINT)
     for axis, values in zip('xyz', points.T, strict=True):
@@ -101,7 +101,7 @@ def written_chain(message: ChainMessage) -> str:
 
 
 def written_action(message: ActionMessage) -> str:
-    """Return what follows the header of an action."""
+    """Return the lines after the header of an action message."""
     text = ACTION.format(names=', '.join(message.names))
     for time, positions, turns in zip(message.times, message.positions, message.orientations, strict=True):
         sec, nanosec = divmod(round(float(time) * NANOSECONDS), NANOSECONDS)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The paper's experiment: how consistent found parameters are, and how valid."""
+"""The paper's experiment: measures how consistent and how valid the found parameters are."""
 
 from dlo_calibration.experiment.conduct import Plan
 from dlo_calibration.experiment.journal import Journal

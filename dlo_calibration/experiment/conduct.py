@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Conduct: performs what an experiment has not done yet, and writes its tables and pictures."""
+"""Conduct: performs the missing calibrations of an experiment, and writes its tables and pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import time
 from typing import Callable, Iterator, Sequence, TextIO
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, unwritable
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.journal import Journal
@@ -25,18 +25,15 @@ from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.terminal import TaskBar
 from dlo_calibration.search import SEARCHES
 
-LOOK = 0.1  # s between two looks at whether to stop
-NOTE_PERIOD = 30.0  # s between two lines of progress where there is no terminal
-
 
 @dataclass(frozen=True)
 class Plan:
     """
     What an experiment does.
 
-    :param runs: calibrations of each subject with each search, each with a seed of its own.
+    :param runs: calibrations of each subject with each search, each with its own seed.
     :param seed: of the first run.
-    :param evaluations: of a search at most; for the tables.
+    :param evaluations: largest number in a search; for the tables.
     :param workers: processes; 0: one per core.
     :param command: the command that repeats the experiment.
     :param samples: whether the subjects are the samples of the package.
@@ -61,20 +58,19 @@ class Plan:
 def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
             note: Callable[[str], None], stream: TextIO) -> tables.Account | None:
     """
-    Do the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
+    Perform the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
 
-    Where it is stopped, they show what is done by then.
+    If it is stopped, tables and pictures show the runs that are complete.
 
     :param note: called with each sentence for the user.
     :param stream: for a progress bar.
-    :returns: None where nothing is done.
-    :raises InputError: where `folder` cannot be written.
+    :returns: None if no run is complete.
+    :raises InputError: if `folder` cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f'folder {folder}', str(error), 'a folder that can be written to',
-                         'choose another one with --output') from error
+        raise unwritable(folder, error, 'folder') from error
     journal = Journal(folder / 'calibrations.jsonl')
     engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
     wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
@@ -101,12 +97,12 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     note(f'tables and pictures are in {folder}')
     if not account.complete:
         note(f'interrupted: {len(done)} of {len(wanted)} calibrations are done; '
-             'the same command goes on from there')
+             'the same command continues with the others')
     return account
 
 
 def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
-    """Prepare the engine of an object, e.g. compile it; return its name."""
+    """Prepare the engine for an object, e.g. compile it; return its name."""
     with closing(make_simulator(subject.observed.options)) as simulator:
         simulator.prepare()
         return simulator.name
@@ -115,7 +111,7 @@ def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
 def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Journal,
                  make_simulator: SimulatorFactory, stop: Callable[[], bool], note: Callable[[str], None],
                  stream: TextIO) -> None:
-    """Do tasks, each in one process, and write down each as it is done."""
+    """Perform tasks, each in one process, and add each outcome to the journal at once."""
     if not waiting:
         return
     if len(waiting) < total:
@@ -127,7 +123,7 @@ def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Jou
             journal.add(task, outcome)
             bar.advance()
             now = time.monotonic()
-            if not bar.shown and now - told > NOTE_PERIOD:
+            if not bar.shown and now - told > 30.0:  # s, in a log file
                 told = now
                 left = (now - begun) / count * (len(waiting) - count)
                 note(f'{total - len(waiting) + count} of {total} calibrations; {left:.0f} s left')
@@ -135,7 +131,7 @@ def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Jou
 
 def _outcomes(waiting: Sequence[Task], workers: int, make_simulator: SimulatorFactory,
               stop: Callable[[], bool], note: Callable[[str], None]) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks as they are done; end early when stopped."""
+    """Yield each task with its outcome when it is done; end early if stopped."""
     if workers == 1:
         for task in waiting:
             try:
@@ -147,12 +143,12 @@ def _outcomes(waiting: Sequence[Task], workers: int, make_simulator: SimulatorFa
         futures: dict[Future[Outcome], Task] = {
             executor.submit(perform, task, make_simulator): task for task in waiting}
         while futures and not stop():
-            for future in wait(futures, LOOK, FIRST_COMPLETED).done:
+            for future in wait(futures, 0.1, FIRST_COMPLETED).done:  # s, then look at `stop` again
                 yield futures.pop(future), future.result()
 
 
 def _draw(group: Sequence[tuple[Task, Outcome]], folder: Path, make_simulator: SimulatorFactory) -> None:
-    """Draw the actions that a run is judged by, of the run whose score is the median."""
+    """Draw the trials that judge a run, for the run with the median score."""
     scored = sorted(((score, found) for found in complete_runs(group)
                      if (score := run_score(found)) is not None), key=lambda one: one[0])
     if not scored:
@@ -169,5 +165,4 @@ def _write(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding='utf-8')
     except OSError as error:
-        raise InputError(f'file {path}', str(error), 'a place that can be written to',
-                         'choose another one with --output') from error
+        raise unwritable(path, error) from error

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Journal: the outcomes of an experiment on the disk, so that it goes on where it was ended."""
+"""Journal: keeps the outcomes of an experiment on disk, so that it can continue after an interruption."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dlo_calibration.experiment.study import Task
 
 class Journal:
     """
-    The outcomes of an experiment, in a file with one JSON document a line.
+    The outcomes of an experiment, in a file with one JSON document per line.
 
-    A line that was cut, as where a process was killed, does not count.
+    An incomplete line, which a killed process leaves, is ignored.
 
-    :raises InputError: where the file cannot be read.
+    :raises InputError: if the file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,14 +40,14 @@ class Journal:
         self._cut = bool(text) and not text.endswith('\n')
 
     def find(self, task: Task) -> Outcome | None:
-        """Return the outcome of a task; None where it is not done."""
+        """Return the outcome of a task; None if it is not done."""
         return self._outcomes.get(task.key)
 
     def add(self, task: Task, outcome: Outcome) -> None:
         """
-        Write down an outcome, on the disk when this returns.
+        Append an outcome; it is on disk when this returns.
 
-        :raises InputError: where it cannot be written.
+        :raises InputError: if it cannot be written.
         """
         line = json.dumps({
             'object': task.subject.name, 'search': task.search, 'seed': task.seed, 'engine': task.engine,

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Outcome: what one calibration of an experiment finds, and how well that explains what judges it."""
+"""Outcome: the parameters that a calibration finds, and how well they explain the trials that judge it."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from dlo_calibration.model.trial import Trial
 @dataclass(frozen=True)
 class Judgement:
     """
-    How well found parameters explain a trial that they were not found with.
+    How well the found parameters explain a trial that was not calibrated on.
 
-    :param score: difference score [cm]; None where it could not be simulated.
+    :param score: difference score [cm]; None if the trial could not be simulated.
     :param error: mean point error [m]; None likewise.
-    :param share: the same in percent of the DLO's length; None likewise.
+    :param share: mean point error [% of the DLO's length]; None likewise.
     """
 
     trial: str
@@ -43,14 +43,15 @@ class Outcome:
     """
     What one calibration found.
 
-    :param values: of the parameters, 0..100; empty where it failed.
-    :param excited: names of those that the trials tell anything about; the others have their default.
+    :param values: of the parameters, 0..100; empty if it failed.
+    :param excited: names of the parameters that the trials inform about; the others keep their default.
     :param score: average difference score of the trials calibrated on [cm].
-    :param error: mean point error of those [m].
-    :param evaluations: of the search.
-    :param simulations: rollouts in all.
-    :param seconds: it took, in one process.
-    :param failure: why it failed; empty where it did not.
+    :param error: mean point error of the same trials [m].
+    :param evaluations: number of evaluations of the search.
+    :param simulations: number of rollouts in all.
+    :param seconds: its duration in one process [s].
+    :param judgements: one for each trial that judges it.
+    :param failure: why it failed; empty if it did not.
     """
 
     values: Mapping[str, float]
@@ -65,7 +66,7 @@ class Outcome:
 
     @classmethod
     def of(cls, entry: Mapping[str, Any]) -> Outcome:
-        """Build from what `asdict` gave; raise TypeError, KeyError or ValueError where that is not one."""
+        """Build from the values of `asdict`; raise TypeError, KeyError or ValueError for any others."""
         return cls(**{**entry, 'excited': tuple(entry['excited']), 'values': dict(entry['values']),
                       'judgements': tuple(Judgement(**one) for one in entry['judgements'])})
 
@@ -73,9 +74,9 @@ class Outcome:
 def perform(task: Task, make_simulator: SimulatorFactory,
             should_stop: Callable[[], bool] = lambda: False) -> Outcome:
     """
-    Do one calibration in this process, and judge it.
+    Calibrate once in this process, and judge the parameters found.
 
-    :raises CancelledError: when stopped.
+    :raises CancelledError: if stopped.
     """
     options, trials, begun = task.options, task.trials, time.monotonic()
     with closing(make_simulator(options)) as simulator:
@@ -98,9 +99,9 @@ def perform(task: Task, make_simulator: SimulatorFactory,
 
 def judged_chains(task: Task, outcome: Outcome, make_simulator: SimulatorFactory
                   ) -> list[tuple[Trial, Floats]]:
-    """Return the trials that a task is judged by, each with its simulated (g, n, 3) [m] goals."""
+    """Return the trials that judge a task, each with its simulated chains at the goals, (g, n, 3) [m]."""
     judges, found = task.judges, []
-    space = replace(task.options.space, free=tuple(outcome.values))  # of as many parts as were found
+    space = replace(task.options.space, free=tuple(outcome.values))  # with the parts that the search found
     with closing(make_simulator(judges.options)) as simulator:
         for trial in judges.trials:
             physical = space.physical(outcome.values, trial.initial.length)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Study: which calibrations the paper's two questions take.
+Study: the calibrations that answer the paper's two questions.
 
-Consistency: does a calibration find the same parameters whatever the random seed is?
-Validity: do they explain an action that was not calibrated on?  (Alvarez, Yamazaki
+Consistency: does a calibration find the same parameters with every random seed?
+Validity: do the parameters explain an action that was not calibrated on?  (Alvarez, Yamazaki
 and Matsubara, tables 1 and 2.)
 """
 
@@ -24,13 +24,13 @@ from dlo_calibration.calibration.options import MACHINE, names_of, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.trial import Trial
 
-#: Rooms that only show what others found: a change there makes no calibration obsolete.
+#: Folders whose code cannot change what a calibration finds.
 SHOWING = ('cli', 'report', 'ros')
 
 
 @dataclass(frozen=True)
 class Observed:
-    """Trials of a DLO, and the options to simulate them with."""
+    """The trials of a DLO, and the options to simulate them with."""
 
     trials: tuple[Trial, ...]
     options: Options
@@ -42,9 +42,9 @@ class Subject:
     One object of the experiment.
 
     :param name: for tables and files; unique.
-    :param observed: what it is calibrated on.
-    :param held_back: indices of trials that are left out of a calibration in turn, to judge it by.
-    :param others: trials that no calibration sees, to judge it by; None: there are none.
+    :param observed: the trials that it is calibrated on.
+    :param held_back: indices of the trials that are left out in turn, each to judge one calibration.
+    :param others: trials that judge every calibration, and are in none; None: there are none.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Subject:
         for index in self.held_back:
             if not 0 <= index < count:
                 raise InputError('--held-back', str(index + 1), f'1 to {count}, the trials of {self.name}',
-                                 'correct the number')
+                                 'correct the number')  # counted from 1, as the trials' names are
         if self.held_back and count < 2:
             raise InputError(f'session {self.name}', 'one trial', 'at least two, one of which is held back',
                              'record more actions, or judge by another session with --validate-on')
@@ -68,9 +68,9 @@ class Task:
     """
     One calibration of an object.
 
-    :param engine: name of the simulator that will do it.
-    :param left_out: index of the trial that it is judged by; None: none is left out,
-        and it is judged by the subject's `others`, if there are any.
+    :param engine: name of the simulator that will be used.
+    :param left_out: index of the trial that is left out and judges it; None: the subject's `others`
+        judge it, if there are any.
     """
 
     subject: Subject
@@ -81,24 +81,24 @@ class Task:
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """What it is calibrated on."""
+        """The trials that are calibrated on."""
         return tuple(trial for k, trial in enumerate(self.subject.observed.trials) if k != self.left_out)
 
     @property
     def options(self) -> Options:
-        """What it is calibrated with."""
+        """The options of the calibration."""
         return replace(self.subject.observed.options, search=self.search, seed=self.seed)
 
     @property
     def judges(self) -> Observed:
-        """What it is judged by."""
+        """The trials that judge it; there may be none."""
         if self.left_out is not None:
             return Observed((self.subject.observed.trials[self.left_out],), self.options)
         return self.subject.others or Observed((), self.options)
 
     @functools.cached_property
     def key(self) -> str:
-        """A digest of all that the outcome depends on: two tasks with the same key have the same outcome."""
+        """A digest of all that the outcome depends on: tasks with the same key have the same outcome."""
         judges = self.judges
         about = [_sources(), self.engine, self.trials, _effective(self.options), judges.trials,
                  _effective(judges.options)]
@@ -108,10 +108,10 @@ class Task:
 def tasks(subjects: Sequence[Subject], searches: Sequence[str], runs: int, seed: int,
           engines: Mapping[str, str]) -> Iterator[Task]:
     """
-    Yield all calibrations of an experiment, the first run of everything before the second.
+    Yield all calibrations of an experiment: the first run of every subject and search, then the second.
 
-    :param seed: of the first run; the next has the next one.
-    :param engines: name of the simulator of each subject, by its name.
+    :param seed: of the first run; each further run adds one.
+    :param engines: name of the simulator, by the subject's name.
     """
     for run in range(runs):
         for subject in subjects:
@@ -127,7 +127,7 @@ def _effective(options: Options) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it; numbers keep every digit."""
+    """Convert a value to types that JSON has; numbers keep every digit."""
     if is_dataclass(value):
         return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, np.ndarray):
@@ -139,7 +139,7 @@ def _plain(value: Any) -> Any:
 
 @functools.cache
 def _sources() -> str:
-    """Return a digest of the program: another one may find something else."""
+    """Return a digest of the source code: other code may find other parameters."""
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
     for file in sorted(folder.rglob('*.py')):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Summary: what many calibrations of the same objects say of consistency and validity, in numbers."""
+"""Summary: measures consistency and validity over many calibrations of the same object."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Spread:
     """
     Mean and standard deviation of a number over runs.
 
-    :param std: of a sample; None with fewer than two runs.
+    :param std: sample standard deviation; None with fewer than two runs.
     """
 
     mean: float
@@ -29,7 +29,7 @@ class Spread:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Spread | None:
-        """Return that of some numbers; None of none."""
+        """Return the spread of numbers; None if there are none."""
         if not numbers:
             return None
         return cls(float(np.mean(numbers)), float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None,
@@ -41,16 +41,18 @@ class Findings:
     """
     What all runs of one search found about one object.
 
-    :param parameters: consistency: each parameter, 0..100, where nothing was left out.
-    :param informed: in how many runs the trials told anything about each; else it has its default.
+    :param parameters: consistency: the value of each parameter, 0..100, calibrated on all trials.
+    :param informed: number of runs in which the trials informed about each parameter; in the
+        others it kept its default.
     :param fitted: mean point error of the trials calibrated on [m].
-    :param score: validity: each run's average difference score over the actions it is judged by [cm].
-    :param very_similar: in how many runs that is below 50.
-    :param error: each run's mean point error of those actions [m].
-    :param share: the same in percent of the length.
-    :param actions: the score of each action by itself, by the name of its trial.
-    :param worst: highest score of one action in one run.
-    :param failures: calibrations that failed, and actions that could not be simulated.
+    :param score: validity: a run's average difference score over the trials that judge it [cm].
+    :param very_similar: number of runs whose score is below `VERY_SIMILAR`.
+    :param error: a run's mean point error over the trials that judge it [m].
+    :param share: the same error [% of the length].
+    :param actions: difference score of each trial by itself, by its name [cm].
+    :param worst: highest difference score of one trial in one run [cm].
+    :param seconds: duration of a calibration on all trials [s].
+    :param failures: number of calibrations that failed, and of trials that could not be simulated.
     """
 
     subject: str
@@ -71,7 +73,7 @@ class Findings:
 
 
 def complete_runs(done: Sequence[tuple[Task, Outcome]]) -> list[list[tuple[Task, Outcome]]]:
-    """Return the calibrations of one subject and search, by run; those of unfinished runs are left out."""
+    """Group the calibrations of one subject and search by run; leave out incomplete runs."""
     by_seed: dict[int, list[tuple[Task, Outcome]]] = {}
     for task, outcome in done:
         by_seed.setdefault(task.seed, []).append((task, outcome))
@@ -80,7 +82,7 @@ def complete_runs(done: Sequence[tuple[Task, Outcome]]) -> list[list[tuple[Task,
 
 
 def run_score(found: Sequence[tuple[Task, Outcome]]) -> float | None:
-    """Return the average difference score of a run over the actions it is judged by [cm]; None: none is."""
+    """Return a run's average difference score over the trials that judge it [cm]; None if there is none."""
     return _mean([one.score for _, outcome in found for one in outcome.judgements])
 
 

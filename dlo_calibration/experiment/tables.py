@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Experiment report: the tables of an experiment as Markdown, CSV and plain values; its pictures."""
+"""Tables: an experiment as Markdown, CSV and plain values, and a picture of its parameters."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.figure import as_text, blank_figure, BLUE, GREEN, PURPLE, write_figure, YELLOW
 
-UNKNOWN = 'not known to us'
-#: Figures of the paper: of its five objects, by the names of the samples that resemble them.
+UNKNOWN = 'not known to us'  # for figures of the paper
+#: The paper's validity [cm], by the sample that resembles its object, and its consistency (0..100).
 PAPER_VALIDITY: Mapping[str, float] = {'object5': 53.0}
 PAPER_SCATTER = (10.0, 28.0)
-COLOURS = (BLUE, YELLOW, GREEN, PURPLE)  # of searches
+COLOURS = (BLUE, YELLOW, GREEN, PURPLE)  # of searches, in turn
 
 
 @dataclass(frozen=True)
 class Account:
     """
-    An experiment as it is told.
+    What the tables of an experiment show.
 
-    :param findings: of each object and search.
-    :param command: that repeats it.
-    :param engine: that simulated.
-    :param runs: of each object and search that were asked for.
-    :param evaluations: of a search at most.
+    :param findings: one for each object and search.
+    :param command: the command that repeats it.
+    :param engine: name of the simulator.
+    :param runs: number of runs of each object and search that were asked for.
+    :param evaluations: largest number in a search.
     :param samples: whether the objects are the package's samples, which resemble the paper's.
-    :param complete: whether everything that was asked for is done.
+    :param complete: whether all runs are done.
     """
 
     findings: tuple[Findings, ...]
@@ -68,23 +68,23 @@ def markdown(account: Account) -> str:
     """Return the account as Markdown."""
     parts = [
         '# Consistency and validity', f'`{account.command}`',
-        f'{account.runs} runs of each object and search, with a random seed each; at most '
-        f'{account.evaluations} evaluations a calibration; engine {account.engine}.']
+        f'{account.runs} runs of each object and search, each with its own random seed; at most '
+        f'{account.evaluations} evaluations per calibration; engine {account.engine}.']
     if not account.complete:
-        parts.append('**Not complete**: the tables are of the runs that are done; '
-                     'the same command does the others.')
+        parts.append('**Not complete**: the tables show the runs that are done; '
+                     'the same command continues with the others.')
     parts += ['## Consistency', 'Average and standard deviation of each parameter over the runs, on the '
-              'scale from 0 to 100, calibrated on all trials.  *Italic*: the trials tell nothing about it, '
-              'so it keeps its default; with a number of runs, in only that many they told something.']
+              'scale from 0 to 100, calibrated on all trials.  *Italic*: the trials do not inform about this '
+              'parameter, so it keeps its default; if a number of runs is given, they do in these runs only.']
     if account.samples:
-        parts.append(f'The paper says of its own runs that parameters scatter by {PAPER_SCATTER[0]:g} to '
-                     f'{PAPER_SCATTER[1]:g}; its figures for each object are {UNKNOWN}.')
+        parts.append(f'In the paper, parameters scatter by {PAPER_SCATTER[0]:g} to {PAPER_SCATTER[1]:g} '
+                     f'over the runs; its figures for each object are {UNKNOWN}.')
     for search in account.searches:
         parts += [f'### {search}', _consistency([one for one in account.findings if one.search == search])]
     parts += ['## Validity', 'Average and standard deviation, over the runs, of the difference score of '
               'actions that were not calibrated on, and of their point error.  '
-              f'**Bold**: below {VERY_SIMILAR:g}, very similar; below {SIMILAR:g} is similar.  '
-              'Seconds are of one calibration on all trials, in one process.', _validity(account)]
+              f'A score below {SIMILAR:g} is similar, and below {VERY_SIMILAR:g} very similar (**bold**).  '
+              'Seconds: one calibration on all trials, in one process.', _validity(account)]
     if any(one.actions for one in account.findings):
         parts += ['Difference score of each action by itself:', _actions(account)]
     return '\n\n'.join(parts) + '\n'
@@ -130,10 +130,10 @@ def runs_csv(done: Sequence[tuple[Task, Outcome]]) -> str:
 
 def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) -> None:
     """
-    Draw the parameters that every run found, the searches beside each other.
+    Draw the parameters that each run found, with the searches beside each other.
 
-    :param done: the calibrations of each object and search.
-    :raises InputError: where the file cannot be written.
+    :param done: one group of calibrations for each object and search.
+    :raises InputError: if the file cannot be written.
     """
     subjects = list(dict.fromkeys(group[0][0].subject.name for group in done))
     searches = list(dict.fromkeys(group[0][0].search for group in done))
@@ -160,7 +160,7 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
     rows[-1].set_xlim(-0.6, len(subjects) - 0.4)
     for which, search in enumerate(searches):
         rows[0].plot([], [], 'o', color=COLOURS[which % len(COLOURS)], label=search)
-    rows[0].plot([], [], 'x', color='0.6', label='the trials tell nothing: default')
+    rows[0].plot([], [], 'x', color='0.6', label='default, as the trials do not inform about it')
     figure.legend(loc='outside upper center', ncols=len(searches) + 1, frameon=False)
     write_figure(figure, path)
 
