@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Measure how well `fit` does on known objects and on measured cables, as a user would.
+Measure the accuracy of `fit` on known objects and on measured cables, with the commands of a user.
 
     python benchmark/accuracy.py [reference] [mocap] [hanging] [--search NAME] [--evaluations N] [--seed S]
 
-Each figure is what `dlo-calibration fit` and `validate` print for sessions that
-convert.py makes; nothing else is computed here but means.  The tables are
-printed, and written to benchmark/results/NAME.md.
+`dlo-calibration fit` and `validate` print each figure, for sessions that convert.py
+makes; this program computes only means.  The tables are printed, and written to
+benchmark/results/NAME.md.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def validate(result: Path, session: Path, *arguments: str) -> dict[str, Any]:
 
 
 def command(*arguments: str) -> dict[str, Any]:
-    """Return the JSON document of a verb."""
+    """Return the JSON document that a verb prints."""
     done = subprocess.run([*COMMAND, *arguments, '--json'], check=True, stdout=subprocess.PIPE,
                           env={**os.environ, 'PYTHONPATH': str(HERE.parent)})
     document: dict[str, Any] = json.loads(done.stdout)
@@ -105,7 +105,7 @@ def mocap(folder: Path, options: list[str]) -> str:
 
 
 def hanging(folder: Path, options: list[str]) -> str:
-    """Tabulate two wires: fitted on four repeats, judged on the fifth; and EI of each repeat by itself."""
+    """Tabulate two wires: fitted on four repeats, judged on the fifth; and EI fitted on each repeat alone."""
     sections = []
     arguments = ['--calibrate', HANGING_PARAMETERS, '--nodes', HANGING_NODES, *options,
                  '--evaluations', MANY_EVALUATIONS]
@@ -154,7 +154,7 @@ TABLES = {'reference': reference, 'mocap': mocap, 'hanging': hanging}
 
 
 def main() -> None:
-    """Make the tables that were asked for."""
+    """Make the tables that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('tables', nargs='*', metavar='TABLE', help=', '.join(TABLES))

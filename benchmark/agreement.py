@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Compare the two engines: the same random trials and parameters in both.
+Compare the two engines: simulate the same trials with the same random parameters in both.
 
     python benchmark/agreement.py [--trials N] [--seed S]
 
-With measured data (DLO_DATA) the trials are the nine actions of each reference
-object; without, those four of each that are in msg_samples.  Nothing is fitted.
+The trials are the nine actions of each reference object if DLO_DATA names the measured
+data, else the four of each object in msg_samples.  Nothing is fitted.
 The table is written to benchmark/results/agreement.md and README.md.
 """
 
@@ -50,7 +50,7 @@ def reference_trials() -> list[tuple[str, float, Trial]]:
 
 
 def cases(count: int, seed: int) -> Iterator[tuple[str, Trial, dict[str, float], float]]:
-    """Draw object, trial, physical parameters that never touch, and a random radius [m]."""
+    """Draw object, trial, physical parameters of a DLO without self-contact, and a random radius [m]."""
     generator = np.random.default_rng(seed)
     trials = reference_trials()
     order = np.concatenate([generator.permutation(len(trials)) for _ in range(-(-count // len(trials)))])
@@ -63,7 +63,7 @@ def cases(count: int, seed: int) -> Iterator[tuple[str, Trial, dict[str, float],
 
 
 def difference(engines: tuple[Simulator, Simulator], trial: Trial, physical: dict[str, float]) -> Floats:
-    """Return the distances of the two engines' points [m]; none where both fail."""
+    """Return the distances between the points of two engines [m]; none if both fail."""
     chains = []
     for engine in engines:
         try:
@@ -79,7 +79,7 @@ def difference(engines: tuple[Simulator, Simulator], trial: Trial, physical: dic
 
 
 def own_spread(engine: Simulator, trial: Trial, physical: dict[str, float]) -> float:
-    """Return how far an engine is from itself [m] where the friction changes by its ten-billionth."""
+    """Return how far an engine's points move at most [m] if the friction changes by one of SHARES."""
     chains = engine.simulate(trial, physical).chains
     return max(float(np.linalg.norm(engine.simulate(
         trial, {**physical, 'friction': physical['friction'] * (1 + share)}).chains - chains, axis=-1).max())

@@ -8,37 +8,37 @@ Convert measured data to sessions that `fit` and `validate` read.
     python benchmark/convert.py mocap     dlo2    OUTPUT [--recordings 0,1,2] [--every 1]
     python benchmark/convert.py hanging   white   OUTPUT [--repeats 0,1,2,3,4]
 
-OUTPUT is the rosbag2 folder to make (or an .mcap file); it is never overwritten,
-a name that is taken gets a number.  The data is read from the folder that
+OUTPUT is the rosbag2 folder (or .mcap file) to make; a name that is taken gets a
+number, so nothing is overwritten.  The data is read from the folder that
 ``--data`` or the environment variable DLO_DATA names, else from ``shared/data``
-beside the repository.  What the data says about mass and table is recorded as
-the options of the session.
+beside the repository.  Mass and table of the data are recorded as options of the
+session.
 
 reference
-    One trial per action.  The noisy chains are sent, each point that a hand
-    grips annotated; where nothing is released, in the goal too.
+    One trial per action, with the noisy chains.  Each point that a hand grips is
+    annotated in the initial chain, and in the goal chain if the hand still holds it.
 
 mocap
-    One trial per recording.  The start is the chain at frame 1 with the velocity
-    of frames 0 to 2: two initial chains, one frame apart, whose last is frame 1
-    and whose difference is half of that between frames 0 and 2.  A hand is
-    where the outer of its two markers is, and turns by the smallest rotation
-    between the first and the present direction from that to the inner one; both
-    markers are gripped.  Every frame from 2 on is a goal that both hands hold,
-    compared at its instant: the last is stamped like the last waypoint.
+    One trial per recording.  It starts at frame 1, with the velocity between frames
+    0 and 2: there are two initial chains, one frame apart.  The second is frame 1,
+    and their difference is half of that between frames 0 and 2.  A hand has two
+    markers and grips both.  It is where its outer marker is, and turns by the smallest
+    rotation from the first direction between its markers to the present one.  Every
+    frame from 2 on is a goal that both hands hold, compared at its instant; the last
+    goal has the time of the last waypoint.
 
 hanging
     One trial per repeat, without a table.  The wire has 51 measured points in
-    the vertical plane y = 0; one more point beyond each end lies inside the
-    clamp, so that each clamp grips two and keeps a direction.  Both clamps are
-    horizontal: the wire leaves the first along +x, turns down, back along -x at
-    the bottom, up, and enters the last along +x.  At the start it is straight
-    along +x at the height of the first clamp, at rest.  No clamp turns, and the
-    first does not move.  The last comes straight towards the first, up to the
-    distance that was measured, while the wire sags; then it goes half around
-    the first, in a horizontal circle, to where it was measured, so that the legs
-    of the loop pass beside each other.  (A motion in the plane would have to turn
-    a clamp by 360 degrees from below, and a limp wire falls over it.)
+    the vertical plane y = 0, and one more point beyond each end, inside the
+    clamp: each clamp grips two points, which fixes the direction of the wire.
+    Both clamps are horizontal.  The wire leaves the first clamp along +x, turns
+    down, goes back along -x at the bottom, turns up, and enters the last clamp along
+    +x.  At the start it is at rest, straight along +x at the height of the first
+    clamp.  No clamp turns, and the first does not move.  The last clamp moves
+    straight towards the first, up to the measured distance, while the wire sags.
+    Then it moves half around the first, in a horizontal circle, to its measured
+    position, so that the legs of the loop pass beside each other.  (A motion in the
+    plane would have to turn a clamp by 360 degrees, and a limp wire would fall over it.)
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def nanoseconds(seconds: float) -> int:
 
 
 def held(count: int, grips: Mapping[int, int]) -> NDArray[np.uint8]:
-    """Return the annotation of `count` points; `grips` gives the hand number of gripped ones."""
+    """Return the annotation of `count` points; `grips` has the number of the hand for each gripped one."""
     hands = np.zeros(count, np.uint8)
     for point, hand in grips.items():
         hands[point] = hand
@@ -131,7 +131,7 @@ def mocap_trials(points: Floats, rate: float, every: int) -> Trials:
 
     :param points: (r, f, n, 3) [m] markers of r recordings of f frames.
     :param rate: of the frames [Hz].
-    :param every: every how manieth frame is a goal.
+    :param every: 1 if every frame is a goal, 2 if every second one is, and so on.
     """
     for k, frames in enumerate(points):
         start = EPOCH + k * TRIAL_PERIOD
@@ -179,7 +179,7 @@ def hanging_trials(repeats: Floats, length: float) -> Trials:
 
 
 def write_session(output: Path, trials: Trials, options: Mapping[str, Any]) -> tuple[Path, int]:
-    """Write trials to a new session; return where it is, and how many they are."""
+    """Write trials to a new session; return its path, and the number of trials."""
     types, count = bag_types(), 0
     with SessionWriter(output, options) as writer:
         for messages in trials:
@@ -244,7 +244,7 @@ SOURCES = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Convert as the command line says; 0, or 2 where that cannot be done."""
+    """Convert as the command line asks; return 0, or 2 if that is not possible."""
     parser = argparse.ArgumentParser(description='Convert measured data to sessions.')
     parser.add_argument('--data', type=Path, default=Path(os.environ.get('DLO_DATA', DATA)),
                         help='folder of the data (default: DLO_DATA, or shared/data beside the repository)')

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Measure the engine's own error: reference objects with their true properties.
+Measure the discretisation error of the engine, on reference objects with their true properties.
 
     python benchmark/discretisation.py
 
-Nothing is fitted, and the chains are the noiseless ones, so what is left is the
-difference to the fine rod (101 nodes, 0.5 ms) that the objects were made with.
+Nothing is fitted, and the chains have no noise: the remaining error is the difference
+from the fine rod (101 nodes, 0.5 ms) that the objects were made with.
 The table is printed, and written to benchmark/results/discretisation.md.
 """
 

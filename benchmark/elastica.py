@@ -6,9 +6,9 @@ Compare the bending stiffness of hanging wires with that of the planar elastica,
 
     python benchmark/elastica.py
 
-Both fit bending stiffness and length to the first repeat of each wire of the folder
-hanging of DLO_DATA: the elastica as a boundary value problem with horizontal clamps (SciPy's
-collocation), this package by simulation with more and more nodes.  The table
+Both fit bending stiffness and length to the first repeat of each wire in the folder hanging
+of DLO_DATA.  The elastica is a boundary value problem with horizontal clamps, solved by
+SciPy's collocation; this package simulates, with an increasing number of nodes.  The table
 is printed, and written to benchmark/results/elastica.md.
 """
 
@@ -63,7 +63,7 @@ class Elastica:
         self._known = self._places, np.vstack([*points.T, theta, np.gradient(theta, self._places)]), GUESS
 
     def residuals(self, stiffness: float, length: float) -> Floats:
-        """Return (2 n,) [m] solved minus measured coordinates; the next solution starts from this one."""
+        """Return solved minus measured coordinates, (2 n,) [m]; the next solution starts from this one."""
         def slope(s: Floats, y: Floats, force: Floats) -> Floats:
             vertical = force[1] + self._weight * s * length
             moment = force[0] * np.sin(y[2]) - vertical * np.cos(y[2])
@@ -94,7 +94,7 @@ class Elastica:
 
 
 def simulated(session: Path, nodes: int) -> tuple[float, float, float]:
-    """Return stiffness [N m^2], length by the measured one, and the root mean square distance [m]."""
+    """Return stiffness [N m^2], length divided by the measured one, and root mean square distance [m]."""
     read = read_session(session)
     options = replace(read.options, calibrate=('flexibility', 'length_scale'))
     evaluator = Evaluator(read.trials, options.space, CompiledSimulator(table=False, nodes=nodes))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Tabulate what the chains alone say of the parameters of known objects, and of hanging wires.
+Tabulate the parameters that are estimated from the chains alone, for known objects and hanging wires.
 
     python benchmark/estimates.py
 

@@ -6,8 +6,8 @@ Repeat the paper's experiment on the reference objects, judged by five actions t
 
     python benchmark/experiment.py [--runs N] [--output DIR]
 
-The sessions are made of the measured data, which DLO_DATA names.  What is done
-in DIR is not done again.  The tables are written to benchmark/results/experiment_other.md.
+The sessions are made from the measured data, which DLO_DATA names.  Calibrations that DIR
+has already are not repeated.  The tables are written to benchmark/results/experiment_other.md.
 """
 
 from __future__ import annotations

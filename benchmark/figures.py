@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures: measured side by side, and written into tables."""
+"""Figures: measures times side by side, and writes tables."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SAMPLES = HERE.parent / 'msg_samples'
 def side_by_side(benchmark: Any, calls: Mapping[str, Callable[[], object]], rounds: int,
                  clock: Callable[[], float] = time.process_time) -> dict[str, float]:
     """
-    Return the shortest time [s] of each call; they take turns, so that all meet the same disturbances.
+    Return the shortest time [s] of each call; the calls take turns, so that disturbances affect all.
 
     :param benchmark: pytest-benchmark's fixture, which shows the last of the calls.
-    :param clock: `process_time` leaves out what other programs take; `perf_counter` where several
+    :param clock: `process_time`, which other programs do not affect; `perf_counter` if several
         processes work.
     """
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -45,7 +45,7 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def machine() -> str:
-    """Say what was measured on."""
+    """Describe the machine, its Python and its load."""
     model = re.search(r'model name\s*: (.*)', Path('/proc/cpuinfo').read_text(encoding='utf-8'))
     name = model[1] if model else platform.processor() or platform.machine()
     return (f'{name}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}; load average '
@@ -54,10 +54,10 @@ def machine() -> str:
 
 def write(name: str, command: str, how: str, text: str) -> None:
     """
-    Write results/NAME.md, and the same between the markers of that name in README.md.
+    Write results/NAME.md, and the same text between the markers of that name in README.md.
 
-    :param command: that makes the figures.
-    :param how: in one or two sentences.
+    :param command: the command that makes the figures.
+    :param how: how they were measured, in one or two sentences.
     """
     target = HERE / 'results' / f'{name}.md'
     target.parent.mkdir(exist_ok=True)

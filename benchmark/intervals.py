@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Judge calibrations of the reference objects against their known truth, over many draws of the noise.
+Compare calibrations of the reference objects with their true parameters, over many draws of the noise.
 
     python benchmark/intervals.py [--draws 100] [--workers 2]
 
@@ -47,7 +47,7 @@ TRUTH = {'flexibility': 'EI', 'elasticity': 'EA', 'friction': 'mu', 'self_collis
 
 @dataclass(frozen=True)
 class Draw:
-    """One calibration."""
+    """One calibration, on one draw of the noise."""
 
     values: np.ndarray
     std: np.ndarray

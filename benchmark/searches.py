@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Compare the searches on the sample objects: how many evaluations, how exact, how often in a worse minimum.
+Compare the searches on the sample objects: evaluations, accuracy, and how often one ends in a worse minimum.
 
     python benchmark/searches.py [--seeds N] [--engine NAME] [SEARCH ...]
 
-For each object, the score to reach is the median of what 150 random parameter sets
-reach.  The cost of a result is the robust one that least squares minimises, so
-for the other searches it is not what they look for; it compares where they
-end.  The table is printed, and written to benchmark/results/searches.md.
+For each object, the score to reach is the median, over the seeds, of the best score of 150
+random parameter sets.  The cost of a result is the robust cost that least squares minimises;
+the other searches minimise the score, so their cost only shows how close they end.  The
+table is printed, and written to benchmark/results/searches.md.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHOWN = ('flexibility', 'elasticity', 'friction')
 
 def search_with(evaluator: Evaluator, options: Options, name: str, seed: int
                 ) -> tuple[list[Observation], Observation]:
-    """Return all observations of a search, and the one that it calls its result."""
+    """Return all observations of a search, and the one that is its result."""
     search = SEARCHES[name](evaluator.space.dimension, seed, prior(evaluator.trials, options).hints)
     seen: list[Observation] = []
     while len(seen) < BUDGET:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Foxglove's own readers (from npm) read our sessions as we do; needs node, npm and the network."""
+"""Foxglove's readers (from npm) read the same messages from a session as we do; needs npm and the network."""
 
 import json
 import os
@@ -27,7 +27,7 @@ PATIENCE = 300  # s
 
 @pytest.fixture(scope='module')
 def foxglove(tmp_path_factory):
-    """Give a function that reads a file with Foxglove's libraries, which are installed elsewhere."""
+    """Give a function that reads a file with Foxglove's libraries, installed in a temporary folder."""
     for program in ('node', 'npm'):
         if shutil.which(program) is None:
             pytest.skip(f'{program} is not installed')
@@ -49,7 +49,7 @@ def foxglove(tmp_path_factory):
 
 
 def plain(message):
-    """Return what a message of the library rosbags holds, as JSON has it."""
+    """Convert a message of the library rosbags to types that JSON has."""
     if hasattr(message, '__msgtype__'):
         return {name: plain(value) for name, value in vars(message).items()
                 if not name.startswith('__') and not name.isupper()}  # those are constants of the type

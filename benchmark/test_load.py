@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How soon the node answers while it calibrates on all cores: `make bench`."""
+"""Measure how fast the node answers while it calibrates on all cores: `make bench`."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ CALLS = 500
 
 
 class Watched(calibrator_node.CalibratorNode):
-    """The node, with a timer that notes when it fires."""
+    """The node, with a timer that records the times at which it fires."""
 
     fired: list[float] = []
 
@@ -38,7 +38,7 @@ class Watched(calibrator_node.CalibratorNode):
 
 
 def watched_node(file, *args):
-    """Be the node until Ctrl-C, then write when the timer fired."""
+    """Run the node until Ctrl-C, then write the times at which the timer fired."""
     calibrator_node.CalibratorNode = Watched
     with StopFlag() as stop:
         calibrator_node.spin(args, stop)
@@ -63,7 +63,7 @@ def running_node(folder, **options):
 
 
 def round_trips(robot):
-    """Call a service of the node; return the times that took [s]."""
+    """Call a service of the node many times; return the duration of each call [s]."""
     from rcl_interfaces.srv import GetParameters
     import rclpy
 
@@ -95,7 +95,7 @@ def rows():
 
 @pytest.mark.parametrize('engine', ['none', 'compiled', 'bullet'])
 def test_the_node_answers_while_it_calibrates(engine, rows, tmp_path, monkeypatch):
-    """The node is idle for `none`."""
+    """Measure the node; without a calibration if the engine is `none`."""
     monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % demo.LAST_DOMAIN))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros'))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether memory stays flat over many rounds: `make bench`."""
+"""Measure whether the memory in use stays constant over many rollouts: `make bench`."""
 
 import os
 from pathlib import Path
@@ -27,7 +27,7 @@ def resident():
 
 
 def memory(name, rounds):
-    """Return rounds done and kB at each look, of rounds with random parameters."""
+    """Roll out with random parameters; return the number of rounds and the memory [kB] at each look."""
     if name == 'compiled':
         from dlo_calibration.simulation.compiled import CompiledSimulator as Engine
     else:
@@ -50,7 +50,7 @@ def memory(name, rounds):
 
 @pytest.fixture(scope='module')
 def rows():
-    """Collect rows, and write them when all are there."""
+    """Collect the rows, and write the table when it is complete."""
     found = []
     yield found
     if len(found) == len(ROUNDS):

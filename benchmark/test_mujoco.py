@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""MuJoCo's cable as a yardstick: the same cantilever falls and comes to rest in both: `make bench`."""
+"""Compare with MuJoCo's cable: the same cantilever falls and comes to rest in both engines: `make bench`."""
 
 import math
 import time
@@ -78,7 +78,7 @@ def cantilever(elements):
 
 
 def elastica(clamp):
-    """Return the tip at rest [m] of a cantilever under its weight, from the clamp's end on: the elastica."""
+    """Return the tip [m] of a cantilever at rest under its weight, relative to the clamp, by the elastica."""
     load = MASS / LENGTH * GRAVITY
     free = LENGTH - clamp
 
@@ -95,7 +95,7 @@ def elastica(clamp):
 
 @pytest.fixture(scope='module')
 def rows():
-    """Collect rows, and write them when all are there."""
+    """Collect the rows, and write the table when it is complete."""
     found = []
     yield found
     if len(found) == 3 * len(ELEMENTS):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How much faster several processes are, and where the time of a whole `fit` goes: `make bench`."""
+"""Measure the speed-up by several processes, and the time of each stage of `fit`: `make bench`."""
 
 from itertools import pairwise
 import json
@@ -35,7 +35,7 @@ STAGES = {'imports': 'interpreter and imports', 'reading': 'session',
 
 @pytest.fixture(scope='module')
 def processes():
-    """Collect rows, and write them when all are there."""
+    """Collect the rows, and write the table when it is complete."""
     rows = []
     yield rows
     if len(rows) == len(MEASURED) * len(WORKERS):
@@ -113,7 +113,7 @@ sys.exit(code)
 
 
 def fit_of(folder, engine, workers):
-    """Return seconds of each stage of `fit` in a fresh process."""
+    """Return the duration of each stage of `fit` in a new process [s]."""
     begun = time.time()
     done = subprocess.run(
         [sys.executable, '-c', PROGRAM, 'fit', str(SAMPLES / 'object1'), '--output', str(folder), '--json',
@@ -145,7 +145,7 @@ def test_fit(benchmark, tmp_path, fits):
 
 @pytest.fixture(scope='module')
 def fits():
-    """Collect rows, and write them."""
+    """Collect the rows, and write the table."""
     rows = []
     yield rows
     if rows:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How fast both engines simulate, and what a rollout's time is spent on: `make bench`."""
+"""Measure the speed of both engines, and the time of each part of a rollout: `make bench`."""
 
 import time
 
@@ -32,7 +32,7 @@ def object1():
 
 @pytest.fixture(scope='module')
 def tables():
-    """Collect rows, and write them when all are there."""
+    """Collect the rows, and write the tables when they are complete."""
     speeds, trials, parts = [], [], []
     yield speeds, trials, parts
     if len(parts) < len(NODES) or len(trials) < len(ACTIONS):
@@ -84,7 +84,7 @@ def test_trial(benchmark, number, tables):
 
 
 class Watch:
-    """Measures the time that a kernel takes, in place of which it is called."""
+    """Stands in for a kernel, calls it, and measures its time."""
 
     def __init__(self, kernel, prepare=lambda arguments: None):
         self.kernel, self.prepare, self.seconds = kernel, prepare, 0.0
@@ -99,7 +99,7 @@ class Watch:
 
 
 def look_for_no_contact(arguments):
-    """Change the rope that `kernels.advance` is called with so that no pair of segments is ever looked at."""
+    """Change the rope of `kernels.advance` so that it checks no pair of segments for contact."""
     contact = arguments[0].contact
     contact.room[0], contact.near[0] = np.inf, 0
 
@@ -107,7 +107,7 @@ def look_for_no_contact(arguments):
 @pytest.mark.benchmark(timer=time.process_time)
 @pytest.mark.parametrize('nodes', NODES)
 def test_parts(benchmark, nodes, tables, monkeypatch):
-    """The kernels are measured where Python calls them; self-contact, as what its absence saves."""
+    """Measure kernels where Python calls them, and self-contact as the time saved without it."""
     trials, physical = object1()
     simulator = CompiledSimulator(nodes=nodes)
     advance, start = kernels.advance, kernels.start_distances

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How long commands take to start, and what they load: `make bench`."""
+"""Measure how long commands take to start, and which slow modules they load: `make bench`."""
 
 from importlib.util import find_spec
 import os
@@ -27,7 +27,7 @@ PATIENCE = 60  # s
 
 
 def finish(words, *options):
-    """Return what a command says on stderr when it has ended; the node is ended when it is ready."""
+    """Return the stderr of a command when it has ended; the node is stopped when it is ready."""
     process = subprocess.Popen([sys.executable, *options, '-m', *words], env=ENVIRONMENT, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     said = []
@@ -46,7 +46,7 @@ def finish(words, *options):
 
 @pytest.fixture(scope='module')
 def rows():
-    """Collect rows, and write them."""
+    """Collect the rows, and write the table."""
     found = []
     yield found
     if found:
