@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search methods behind ask / tell; SEARCHES is the table of them."""
+"""Search methods with the same ask / tell interface; SEARCHES lists them by name."""
 
 from __future__ import annotations
 

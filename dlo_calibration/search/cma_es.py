@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The covariance matrix adaptation evolution strategy, of the library `cma`: needs the score alone."""
+"""CMA-ES (covariance matrix adaptation evolution strategy) of the library `cma`; it uses only the score."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 
-FIRST_SIGMA = 0.25  # a quarter of the range: the optimum is within two of them from the centre
-DONE_SIGMA = 1e-3  # standard deviation of the points asked at which it has converged
+DONE_SIGMA = 1e-3  # standard deviation of new points, in the unit cube, below which it has converged
 
 
 class CmaEs(PlannedSearch):
     """
     Minimise the score with a population whose covariance adapts (Hansen, arXiv:1604.00772).
 
-    Only the order of the scores counts.  One batch is one generation.
+    Only the ranking of the scores matters.  Each batch is one generation.
 
     :param dimension: number of parameters.
     :param seed: of the `numpy.random.Generator`.
-    :param hints: their start is the first mean.
+    :param hints: `hints.start` is the first mean of the population.
     """
 
     name = 'cma_es'
@@ -53,13 +52,13 @@ class CmaEs(PlannedSearch):
         try:
             import cma
         except ImportError as error:
-            raise InputError('search cma_es', 'the Python library cma is not installed', 'it',
+            raise InputError('search cma_es', 'the Python library cma is not installed', 'that library',
                              'install it (pip install cma), or choose another search') from error
         generator = np.random.default_rng(self._seed)
         start = np.where(np.isnan(self._hints.start), 0.5, np.clip(self._hints.start, 0, 1))
-        # Its own random numbers and no seed of its own: it would set the one that all of NumPy shares.
-        # No tolerance in units of the score.
-        strategy = cma.CMAEvolutionStrategy(start, FIRST_SIGMA, {
+        # A seed of cma would seed NumPy's global generator, so it gets `randn` instead.  The score has no
+        # tolerance.  The first deviation is 0.25: the whole range lies within two of them from its centre.
+        strategy = cma.CMAEvolutionStrategy(start, 0.25, {
             'bounds': [0, 1], 'seed': np.nan, 'randn': lambda *shape: generator.standard_normal(shape),
             'verbose': -9, 'tolx': DONE_SIGMA, 'tolfun': 0, 'tolfunhist': 0, 'maxiter': np.inf,
             'maxstd': np.inf})
@@ -69,8 +68,8 @@ class CmaEs(PlannedSearch):
             scores = np.array([one.score for one in observations])
             good = np.isfinite(scores)
             if not good.any():
-                continue  # there is nothing to learn, and the next ones are drawn likewise
-            scores[~good] = 2 * np.abs(scores[good]).max() + 1  # the last in order, which is all that counts
+                continue  # all failed: ask for another sample of the same distribution
+            scores[~good] = 2 * np.abs(scores[good]).max() + 1  # failed points rank last
             strategy.tell(list(points), scores.tolist())
         if 'tolx' in strategy.stop():
             return f'converged: new points differ by less than {DONE_SIGMA * 100:g} of 100'

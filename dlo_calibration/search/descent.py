@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A descent: where it stands, what its linear model of the residuals says, and the step that follows."""
+"""Descent: the state of one Gauss-Newton descent, its linear model of the residuals and its next step."""
 
 from __future__ import annotations
 
@@ -16,64 +16,74 @@ from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Observation
 
-FIRST_RADIUS = 0.25  # of a step, in each parameter
-DAMPING = 1e-4  # of the largest column's length: enough that a parameter without effect stays
-NEAR = 0.03  # so near a Jacobian counts as measured here, and another minimum as the same
-RIVAL = 3.0  # times the cost where a slow descent stands: a start that costs less is as promising
+#: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
+NEAR = 0.03
 
 
 @dataclass
 class Descent:
-    """Where a descent stands; the Jacobian was measured at `origin`, and updated since by some steps."""
+    """
+    State of one descent in the unit cube of d parameters.
+
+    :param point: (d,) current point.
+    :param residuals: (m,) [m] at that point.
+    :param loss: robust loss; its threshold never grows during the descent.
+    :param jacobian: (m, d) [m per unit cube], measured at `origin` and updated by later steps.
+    :param radius: largest step in each parameter.
+    :param roughness: [m] root mean square of the residuals' change that the model missed in the last step.
+    :param origin: (d,) where the Jacobian was measured by finite differences; None: it was not.
+    :param moves: number of moves since then.
+    :param ended: why the descent ended, in words; empty while it goes on.
+    """
 
     point: Floats
     residuals: Floats
     loss: Huber
     jacobian: Floats
-    radius: float = FIRST_RADIUS
-    roughness: float = 0.0  # [m] root mean square of what the last step's model did not predict
+    radius: float = 0.25  # a quarter of the range
+    roughness: float = 0.0
     origin: Floats | None = None
-    updates: int = 0  # moves since the Jacobian was measured
+    moves: int = 0
     ended: str = ''
 
     @property
     def cost(self) -> float:
-        """By its loss [m^2]."""
+        """Robust cost [m^2] of the current residuals."""
         return self.loss.cost(self.residuals)
 
     @property
     def model(self) -> Linearisation:
-        """Linear model of the residuals around it."""
+        """Linear model of the residuals around the current point."""
         return Linearisation(self.point, self.residuals, self.jacobian)
 
     @property
-    def known_here(self) -> bool:
-        """Whether the Jacobian was measured no further away than its own differences reach."""
+    def jacobian_is_fresh(self) -> bool:
+        """Whether the Jacobian was measured at a point near the current one."""
         return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
 
-    def rivals(self, starts: Sequence[Observation]) -> bool:
-        """Whether one of the starts costs hardly more than it does here."""
-        return any(self.loss.cost(one.residuals) < RIVAL * self.cost for one in starts)
+    def has_rival(self, starts: Sequence[Observation]) -> bool:
+        """Tell whether a start point costs less than three times the current point: it is as promising."""
+        return any(self.loss.cost(one.residuals) < 3 * self.cost for one in starts)
 
     def move(self, observation: Observation) -> None:
-        """Go on from an observation; the Jacobian stays."""
+        """Move to an observed point; keep the Jacobian."""
         assert observation.residuals is not None
         self.point, self.residuals = observation.point, observation.residuals
         loss = Huber.of(self.residuals)
-        if loss.threshold < self.loss.threshold:  # never larger again, so that costs of one descent compare
+        if loss.threshold < self.loss.threshold:  # it only falls: costs of one descent stay comparable
             self.loss = loss
 
-    def measured(self) -> NDArray[np.bool_]:
-        """(d,) True where going from 0 to 1 changes the residuals by more than their spread."""
+    def visible(self) -> NDArray[np.bool_]:
+        """Return (d,) True where the whole range of a parameter changes the residuals visibly."""
         size = np.linalg.norm(self.jacobian, axis=0)
-        measured: NDArray[np.bool_] = size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0)))
-        return measured
+        visible: NDArray[np.bool_] = size > max(self.loss.threshold, 1e-9 * float(size.max(initial=0.0)))
+        return visible
 
     def step(self, radius: float) -> Floats:
-        """Return the (d,) step to the lowest point of the model within the cube and the radius."""
+        """Return the (d,) step that minimises the model within the unit cube and the radius."""
         from scipy.optimize import lsq_linear
 
-        free = self.measured()
+        free = self.visible()
         step = np.zeros(len(self.point))
         least = np.maximum(-self.point, -radius)[free]
         most = np.minimum(1 - self.point, radius)[free]
@@ -82,9 +92,10 @@ class Descent:
         if not len(columns):
             return step
         model = self.model.columns(columns).weighted(self.loss.roots(self.residuals))
-        # Only the product matters to the solution: d rows in place of m.
+        # A QR decomposition reduces m rows to d with the same solution; damping, relative to the largest
+        # column, keeps parameters without effect where they are.
         upper, rest = _reduced(model.jacobian, -model.residuals)
-        damping = DAMPING * np.linalg.norm(model.jacobian, axis=0).max()
+        damping = 1e-4 * np.linalg.norm(model.jacobian, axis=0).max()
         upper = np.concatenate([upper, damping * np.eye(len(columns))])
         rest = np.concatenate([rest, np.zeros(len(columns))])
         solution = lsq_linear(upper, rest, (least[movable], most[movable]), method='bvls')
@@ -92,11 +103,11 @@ class Descent:
         return step
 
     def predicted(self, step: Floats) -> float:
-        """Return the cost [m^2] that the model promises after a (d,) step."""
+        """Return the cost [m^2] that the model predicts after a (d,) step."""
         return self.loss.cost(self.model.predicted(step))
 
-    def learn(self, one: Observation, base: Floats, before: Floats) -> None:
-        """Update the Jacobian so that it predicts what a step gave (Broyden's rank-one update)."""
+    def update_jacobian(self, one: Observation, base: Floats, before: Floats) -> None:
+        """Update the Jacobian so that it predicts the observed residuals (Broyden's rank-one update)."""
         if one.residuals is None:
             return
         step = one.point - base
@@ -109,7 +120,7 @@ class Descent:
 
 
 def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Return (d, d) and (d,) that have the same least-squares solution as (m, d) and (m,)."""
+    """Reduce an (m, d) matrix and its right side to (d, d) and (d,) with the same least-squares solution."""
     if len(matrix) <= matrix.shape[1]:
         return matrix, right
     q, r = np.linalg.qr(matrix)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bounded robust least squares from several start points: few evaluations, from what the residuals tell."""
+"""Bounded robust least squares from several start points, with few evaluations."""
 
 from __future__ import annotations
 
@@ -18,27 +18,17 @@ from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
 
-FIRST_STEP = 0.015  # of a finite difference; beside a narrow valley larger ones lead astray
-SMALLEST_STEP, LARGEST_STEP = 0.005, 0.2  # below, contacts that come and go are all that one sees
-VISIBLE = 0.2  # share of the loss's threshold by which a finite difference is to change the residuals
-STEP_OVER_ROUGHNESS = 10.0  # a column's change over what the model could not predict
-SPECULATIVE = 1 / 4  # radius of the second point tried, in radii of the first
-DONE_STEP = 1e-3  # converged where the next step is not longer, in any parameter
-DONE_GAIN = 1e-4  # or would not lower the cost by more than this share of it
-NOISE_GAIN = 0.1  # or, where the residuals are rough, than this share of their roughness over their spread,
-MOST_ROUGHNESS = 0.03  # which counts no more than that
-SLOW_GAIN = 0.2  # share of the cost; a descent is slow where a step gains less
-SAME_COST = 1e-3  # two descents that end that near in cost, as a share, found the same minimum
-BEYOND = (0.1, 0.3, 0.5, 0.7, 0.9)  # where the parameter of least effect is tried, too
-WORTH_A_LOOK = 0.02  # share of the cost that such a place promises to save
-REACH = 0.1  # from such a place, in each parameter; a place that is nearer is not tried
-SMOOTH = 0.01  # share of the loss's threshold: the model that predicts so well sees no kinks
-DONE_POLISH = 2e-3  # share of the cost that is worth another look for kinks
-MOST_ITERATIONS = 25  # of a descent
+# Steps and distances are in the unit cube.
+FIRST_STEP = 0.015  # of a finite difference; larger steps mislead beside a narrow valley
+SHORTER = 1 / 4  # radius of the second step that is tried, relative to the first
+DONE_STEP = 1e-3  # converged where the next step changes every parameter by no more than this
+DONE_GAIN = 1e-4  # or is predicted to lower the cost by no more than this share
+SCAN_RADIUS = 0.1  # of a step from a scanned point; points nearer than this to the minimum are not scanned
+MOST_ITERATIONS = 25  # of one descent
 
 
-def lower(one: Floats, other: Floats) -> bool:
-    """Return whether the first residuals [m] cost less, by the narrower of the two losses."""
+def costs_less(one: Floats, other: Floats) -> bool:
+    """Tell whether the first residuals [m] cost less than the second, by the narrower of their losses."""
     loss = min(Huber.of(one), Huber.of(other))
     return loss.cost(one) < loss.cost(other)
 
@@ -47,15 +37,15 @@ class LeastSquares(PlannedSearch):
     """
     Minimise the robust sum of squared residuals within the unit cube.
 
-    Start points fill the space; from the best of them, Gauss-Newton steps
-    within a box (Nocedal and Wright, Numerical Optimization, 2nd ed., 10.3)
-    whose Jacobian comes from finite differences and, between them, from
-    Broyden's update (ibid., 11.1).  Other starts are followed until the lowest
-    minimum was found twice.
+    The start points fill the cube.  A descent from the best of them takes
+    Gauss-Newton steps within a box (Nocedal and Wright, Numerical Optimization,
+    2nd ed., 10.3).  Finite differences give the Jacobian, and Broyden's update
+    (ibid., 11.1) corrects it after each step.  Descents from other start points
+    follow until the lowest minimum was found twice.
 
     :param dimension: number of parameters.
     :param seed: of the start points.
-    :param hints: their start is tried first.
+    :param hints: half of the start points have its estimates; parameters that it calls not excited stay.
     """
 
     name = 'least_squares'
@@ -64,8 +54,9 @@ class LeastSquares(PlannedSearch):
         super().__init__(dimension)
         self._seed = seed
         self._hints = Hints.none(dimension) if hints is None else hints
-        # Contacts that come and go make columns too large, never too small.
-        self._least_effect = np.full(dimension, np.inf)  # [m] root mean square, from 0 to 1
+        # [m] root mean square change of the residuals over the whole range of each parameter.  The smallest
+        # one measured is kept: contacts that come and go make columns too large, never too small.
+        self._least_effect = np.full(dimension, np.inf)
         self._lowest: Observation | None = None
 
     @property
@@ -78,18 +69,18 @@ class LeastSquares(PlannedSearch):
         for one in observations:
             if one.residuals is not None and (
                     self._lowest is None or self._lowest.residuals is None
-                    or lower(one.residuals, self._lowest.residuals)):
+                    or costs_less(one.residuals, self._lowest.residuals)):
                 self._lowest = one
         super().tell(observations)
 
     def _plan(self) -> Plan:
-        starts = self._in_turn((yield from self._starts()))
+        starts = self._by_cost((yield from self._starts()))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
-        found, checks, looked = 1, 0, False  # `found`: times that the best minimum was reached
+        found, checks, looked = 1, 0, False  # `found`: how often the best minimum was reached
         while found < 2 and checks < 2 and not self._hints.refines:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > NEAR]
-            if not best.ended and not best.rivals(starts):
+            if not best.ended and not best.has_rival(starts):
                 best = yield from self._descend(best, None, ())
             if best.ended:
                 self._to_lowest(best)
@@ -102,7 +93,7 @@ class LeastSquares(PlannedSearch):
             begun = beyond.pop() if beyond else self._begin(starts.pop(0))
             checks += independent and bool(best.ended)
             descent = yield from self._descend(begun, best, starts)
-            same, better = self._same(descent, best), lower(descent.residuals, best.residuals)
+            same, better = self._same_minimum(descent, best), costs_less(descent.residuals, best.residuals)
             found = found + independent if same else 1 if better else found
             if better:
                 best = descent
@@ -112,7 +103,7 @@ class LeastSquares(PlannedSearch):
             self._to_lowest(best)
             for begun in (yield from self._look_beyond(best)):
                 descent = yield from self._descend(begun, best, ())
-                if lower(descent.residuals, best.residuals):
+                if costs_less(descent.residuals, best.residuals):
                     best, found = descent, 1
             if not best.ended:
                 best = yield from self._descend(best, None, ())
@@ -121,13 +112,13 @@ class LeastSquares(PlannedSearch):
 
     def _polish(self, here: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
         """
-        Look from the minimum to both sides of each parameter, over the kinks that narrow differences see.
+        Improve a minimum with wide differences, which kinks of the residuals disturb less than narrow ones.
 
-        :returns: where that leads to, which is here where nothing costs visibly less.
+        :returns: the improved descent, or `here` where no point costs clearly less.
         """
-        for _ in range(3):  # looks, each from where the one before led
-            columns = np.flatnonzero(here.measured())
-            if not len(columns) or here.roughness < SMOOTH * here.loss.threshold:
+        for _ in range(3):
+            columns = np.flatnonzero(here.visible())
+            if not len(columns) or here.roughness < 0.01 * here.loss.threshold:  # smooth: there are no kinks
                 break
             least = self._least_effect[columns].max(initial=0.0) / self._least_effect
             reach = np.clip(STEP * np.sqrt(least), STEP, 5 * STEP)
@@ -139,11 +130,11 @@ class LeastSquares(PlannedSearch):
                 column = slope([one.point[k] for one in two], [one.residuals for one in two])
                 wide[:, k] = wide[:, k] if column is None else column
             there = Descent(here.point, here.residuals, here.loss, wide, NEAR, origin=here.point)
-            steps = [there.step(radius) for radius in (REACH, NEAR, NEAR / 3)]
+            steps = [there.step(radius) for radius in (SCAN_RADIUS, NEAR, NEAR / 3)]
             tried = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
             best = min((*seen, *tried), key=lambda one: here.loss.cost(one.residuals))
-            if here.loss.cost(best.residuals) >= (1 - DONE_POLISH) * here.cost:
-                break
+            if here.loss.cost(best.residuals) >= (1 - 2e-3) * here.cost:
+                break  # a gain of less than 0.2 % is not worth another iteration
             here = replace(here, jacobian=wide, origin=here.point)
             here.move(best)
         return here
@@ -155,32 +146,33 @@ class LeastSquares(PlannedSearch):
 
     def _look_beyond(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
         """
-        Look along the whole range of the parameter of least effect: minima lie side by side there.
+        Try points along the range of the parameter of least effect, where minima often lie side by side.
 
-        :returns: the best place there, if it promises a lower cost.
+        :returns: a descent at the best of them, if its predicted cost is at least 2 % lower; else none.
         """
-        free = np.flatnonzero(here.measured())
+        free = np.flatnonzero(here.visible())
         if not len(free):
             return []
         weakest = free[np.argmin(self._least_effect[free])]
-        targets = np.array([value for value in BEYOND if abs(value - here.point[weakest]) > REACH])
-        points = np.tile(here.point, (len(targets), 1))
-        points[:, weakest] = targets
+        values = np.array([value for value in (0.1, 0.3, 0.5, 0.7, 0.9)
+                           if abs(value - here.point[weakest]) > SCAN_RADIUS])
+        points = np.tile(here.point, (len(values), 1))
+        points[:, weakest] = values
         observations = yield points
         found = []
         for one in observations:
             if one.residuals is not None:
                 there = Descent(one.point, one.residuals, here.loss, here.jacobian, NEAR, origin=here.origin)
-                predicted = there.predicted(there.step(REACH))
+                predicted = there.predicted(there.step(SCAN_RADIUS))
                 found.append((min(predicted, there.cost), there))
         found.sort(key=lambda pair: pair[0])
-        return [there for predicted, there in found[:1] if predicted < (1 - WORTH_A_LOOK) * here.cost]
+        return [there for predicted, there in found[:1] if predicted < (1 - 0.02) * here.cost]
 
     def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
-        """Ask for start points until one can be simulated."""
+        """Ask for start points until at least one can be simulated."""
         from scipy.stats import qmc
 
-        # Two a parameter, and eight at least; powers of two keep a Sobol sequence balanced.
+        # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
         sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
         hint = np.clip(self._hints.start, 0, 1)
@@ -190,7 +182,7 @@ class LeastSquares(PlannedSearch):
                 return list(observations)
         while True:
             points = sobol.random(count)
-            # Half of them keep to the estimate: where it is good it saves a lot, where it is wrong not all.
+            # Half of them have the prior estimate: a good one saves a lot, a wrong one spoils only half.
             points[::2] = np.where(np.isnan(hint), points[::2], hint)
             points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
             order = np.unique(points, axis=0, return_index=True)[1]
@@ -200,21 +192,22 @@ class LeastSquares(PlannedSearch):
                 return starts
 
     @staticmethod
-    def _in_turn(starts: Sequence[Observation]) -> list[Observation]:
-        """Sort start points by their cost, all by the narrowest of their losses."""
+    def _by_cost(starts: Sequence[Observation]) -> list[Observation]:
+        """Sort start points by their cost, using the narrowest of their losses for all."""
         loss = min(Huber.of(one.residuals) for one in starts if one.residuals is not None)
         return sorted(starts, key=lambda one: loss.cost(one.residuals))
 
     @staticmethod
-    def _same(one: Descent, other: Descent) -> bool:
+    def _same_minimum(one: Descent, other: Descent) -> bool:
+        """Tell whether two descents are near each other, or equal in cost within 0.1 %."""
         loss = min(one.loss, other.loss)
         costs = loss.cost(one.residuals), loss.cost(other.residuals)
-        both = one.measured() & other.measured()
+        both = one.visible() & other.visible()
         apart = np.abs(one.point - other.point)[both].max(initial=0.0)
-        return bool(apart < NEAR or abs(costs[0] - costs[1]) <= SAME_COST * max(costs))
+        return bool(apart < NEAR or abs(costs[0] - costs[1]) <= 1e-3 * max(costs))
 
     def _to_lowest(self, descent: Descent) -> None:
-        """Move to where another descent came by, if that costs less and is near."""
+        """Move to the lowest point of all descents, if it is near."""
         lowest = self._lowest
         if lowest is not None and np.abs(lowest.point - descent.point).max() <= NEAR:
             descent.move(lowest)
@@ -222,10 +215,10 @@ class LeastSquares(PlannedSearch):
     def _descend(self, here: Descent, known: Descent | None, rivals: Sequence[Observation]
                  ) -> Generator[Floats, Sequence[Observation], Descent]:
         """
-        Go down from where a descent stands.
+        Continue a descent until it ends or is given up; `ended` stays empty when it is given up.
 
-        Leave it, with nothing in `ended`, where it leads to the `known` minimum or to
-        a higher one, or is slow while one of its `rivals` costs hardly more.
+        It is given up where it leads to the `known` minimum or to a higher one, or where it is
+        slow and one of the start points `rivals` is as promising.
         """
         slow = 0
         if here.origin is None:
@@ -236,38 +229,39 @@ class LeastSquares(PlannedSearch):
             length = float(np.abs(step).max(initial=0.0))
             if known is not None and self._leads_nowhere(here, step, known):
                 return here
-            visible = max(DONE_GAIN, NOISE_GAIN * min(here.roughness / here.loss.threshold, MOST_ROUGHNESS))
-            if length <= DONE_STEP or gain <= visible * here.cost:
-                if here.known_here:
+            # Where the residuals are rough, a gain below a tenth of their relative roughness is chance.
+            least = max(DONE_GAIN, 0.1 * min(here.roughness / here.loss.threshold, 0.03))
+            if length <= DONE_STEP or gain <= least * here.cost:
+                if here.jacobian_is_fresh:
                     here.ended = (
                         f'converged: the next step would change no parameter by more than '
                         f'{DONE_STEP * 100:g} of 100' if length <= DONE_STEP else
-                        f'converged: the next step would lower the cost by less than {visible * 100:.2g} %')
+                        f'converged: the next step would lower the cost by less than {least * 100:.2g} %')
                     return here
-                yield from self._measure(here, np.flatnonzero(here.measured()))
+                yield from self._measure(here, np.flatnonzero(here.visible()))
                 continue
             before = here.cost
             reach = min(length, here.radius)
             moved = yield from self._try(here)
             gained = 1 - here.cost / before
-            if here.known_here and reach < NEAR and gained <= visible:
-                here.ended = f'converged: the last step lowered the cost by less than {visible * 100:.2g} %'
+            if here.jacobian_is_fresh and reach < NEAR and gained <= least:
+                here.ended = f'converged: the last step lowered the cost by less than {least * 100:.2g} %'
                 return here
-            slow = slow + 1 if gained < SLOW_GAIN else 0
+            slow = slow + 1 if gained < 0.2 else 0  # consecutive steps of little gain
             if slow and known is not None and known.loss.cost(here.residuals) > 2 * known.cost:
                 return here
-            if slow > 1 and here.rivals(rivals):
+            if slow > 1 and here.has_rival(rivals):
                 return here
-            if not moved and here.updates:
-                yield from self._measure(here, np.flatnonzero(here.measured()))
+            if not moved and here.moves:
+                yield from self._measure(here, np.flatnonzero(here.visible()))
         here.ended = f'stopped after {MOST_ITERATIONS} steps'
         return here
 
     @staticmethod
     def _leads_nowhere(here: Descent, step: Floats, known: Descent) -> bool:
-        """Return whether a descent nears the known minimum, or flattens out above it."""
+        """Tell whether a descent approaches the known minimum, or flattens out at a higher cost."""
         target = here.point + step
-        both = here.measured() & known.measured()
+        both = here.visible() & known.visible()
         near = np.abs(target - known.point)[both].max(initial=0.0) < NEAR and (
             np.abs(here.point - known.point)[both].max(initial=0.0) < 2 * NEAR)
         higher = known.loss.cost(here.residuals) > known.cost
@@ -275,9 +269,9 @@ class LeastSquares(PlannedSearch):
         return bool(higher and (near or flat))
 
     def _try(self, here: Descent) -> Generator[Floats, Sequence[Observation], bool]:
-        """Try the step within the radius and a shorter one; move to the better if it costs less."""
+        """Try the step within the radius and a shorter one; move to the better one if it lowers the cost."""
         steps = [here.step(here.radius)]
-        shorter = here.step(here.radius * SPECULATIVE)
+        shorter = here.step(here.radius * SHORTER)
         if np.abs(steps[0] - shorter).max() > 0.1 * np.abs(steps[0]).max():
             steps.append(shorter)
         observations = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
@@ -293,19 +287,19 @@ class LeastSquares(PlannedSearch):
             if good and chosen == 0:
                 here.radius = min(max(here.radius, 2 * length), 0.5)
             elif chosen == 1 or not good:
-                here.radius = max(length, here.radius * SPECULATIVE) if good else length / 2
+                here.radius = max(length, here.radius * SHORTER) if good else length / 2
         else:
             here.radius = min(float(np.abs(step).max()) for step in steps) / 4
-        # The shortest first: the longest one's update then holds exactly.
+        # The longest step comes last: the updated Jacobian then predicts it exactly.
         for one in sorted(observations, key=lambda seen: float(np.linalg.norm(seen.point - base))):
-            here.learn(one, base, before)
-        here.updates = here.updates + 1 if moved else here.updates
+            here.update_jacobian(one, base, before)
+        here.moves += moved
         return moved
 
     def _measure(self, here: Descent, columns: NDArray[np.intp]
                  ) -> Generator[Floats, Sequence[Observation], None]:
-        """Measure columns of the Jacobian by finite differences at once; move where one costs less."""
-        here.origin, here.updates = here.point, 0
+        """Measure columns of the Jacobian by finite differences; move to the best point if it costs less."""
+        here.origin, here.moves = here.point, 0
         here.jacobian = here.jacobian.copy()
         sizes = self._difference_steps(here)
         seen = yield from self._differences(here, columns, sizes)
@@ -317,7 +311,7 @@ class LeastSquares(PlannedSearch):
 
     def _differences(self, here: Descent, columns: NDArray[np.intp], sizes: Floats
                      ) -> Generator[Floats, Sequence[Observation], list[Observation]]:
-        """Set columns of the Jacobian from steps of those sizes; the other way, where one fails."""
+        """Set columns of the Jacobian from steps of given sizes; where one fails, try the other side."""
         seen: list[Observation] = []
         for _ in range(2):
             if not len(columns):
@@ -333,12 +327,12 @@ class LeastSquares(PlannedSearch):
         return seen
 
     def _difference_steps(self, here: Descent) -> Floats:
-        """Return the (d,) steps of finite differences that change the residuals visibly."""
+        """Return (d,) steps of finite differences that change the residuals well beyond their roughness."""
         if not here.jacobian.any():
             return np.full(self._dimension, FIRST_STEP)
         most = here.loss.threshold
-        wanted = min(max(VISIBLE * most, STEP_OVER_ROUGHNESS * here.roughness), most)
-        # Only a parameter that is weak beside the others is moved far.
+        change = min(max(0.2 * most, 10 * here.roughness), most)  # [m] of the residuals by one difference
+        # Only a parameter of little effect compared with the others takes a large step.
         furthest = FIRST_STEP * self._least_effect[np.isfinite(self._least_effect)].max() / self._least_effect
-        return np.asarray(np.clip(
-            np.minimum(wanted / self._least_effect, furthest), SMALLEST_STEP, LARGEST_STEP))
+        # Differences below 0.005 show little but contacts that come and go.
+        return np.asarray(np.clip(np.minimum(change / self._least_effect, furthest), 0.005, 0.2))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a search method is: it asks for points of the unit cube and is told what they gave."""
+"""Search: a method that asks for points of the unit cube and is told their observations."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from dlo_calibration.model.chain import Floats, frozen_array
 @dataclass(frozen=True)
 class Observation:
     """
-    What one point gave.
+    The result of evaluating one point.
 
     :param point: (d,) in the unit cube.
-    :param score: to be minimised; infinite where the simulation failed.
+    :param score: difference score, to be minimised; infinite where the simulation failed.
     :param residuals: (m,) [m] simulated minus observed coordinates of all
         trials; None where the simulation failed.
     """
@@ -36,8 +36,8 @@ class Hints:
     What is known before the first evaluation, in the unit cube of d parameters.
 
     :param start: (d,) prior estimate; nan where there is none.
-    :param excited: (d,) False where surely no trial shows a parameter.
-    :param refines: `start` is where the search of a simpler model ended: no other start is worth a try.
+    :param excited: (d,) False where no trial can show the effect of a parameter.
+    :param refines: `start` is the result for a simpler model, so that the search starts only there.
     """
 
     start: Floats
@@ -50,12 +50,12 @@ class Hints:
 
     @classmethod
     def none(cls, dimension: int) -> Hints:
-        """Return hints that tell nothing."""
+        """Return hints without an estimate; all parameters count as excited."""
         return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_))
 
     @classmethod
     def at(cls, start: Floats) -> Hints:
-        """Return hints that (d,) `start` is where a search of a simpler model ended."""
+        """Return hints with the result (d,) of a search with a simpler model as the only start."""
         return cls(start, np.ones(len(start), np.bool_), refines=True)
 
 
@@ -68,8 +68,8 @@ class Search(Protocol):
         """
         Return the next (m, d) points to evaluate, m <= limit.
 
-        How many is the method's choice and never depends on the number of
-        workers.  No points at all means that it has finished.
+        The method chooses m, whatever the number of workers.  No points at all
+        mean that it has finished.
         """
 
     def tell(self, observations: Sequence[Observation]) -> None:
@@ -77,8 +77,8 @@ class Search(Protocol):
 
     @property
     def stop_reason(self) -> str:
-        """Why it finished, in words; empty while it has not."""
+        """Why it finished, in words; empty until then."""
 
     @property
     def best(self) -> Floats | None:
-        """The (d,) point that the method calls its result; None while no evaluation succeeded."""
+        """The (d,) point that is the result of the method; None until an evaluation has succeeded."""

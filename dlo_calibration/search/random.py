@@ -12,13 +12,10 @@ import numpy as np
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
-#: Points asked at a time: enough to keep 1, 2, 4, ... 32 processes busy to the end.
-BATCH = 32
-
 
 class RandomSearch:
     """
-    Uniform over the unit cube, independent of what was found.
+    Draw points uniformly from the unit cube, independently of earlier results.
 
     :param dimension: number of parameters.
     :param seed: of the `numpy.random.Generator`.
@@ -33,18 +30,18 @@ class RandomSearch:
         self._generator = np.random.default_rng(seed)
 
     def ask(self, limit: int) -> Floats:
-        """Return the next points (m, d) of one random sequence, however it is divided."""
-        return self._generator.random((min(limit, BATCH), self._dimension))
+        """Return the next (m, d) points, at most 32, of one random sequence that does not depend on m."""
+        return self._generator.random((min(limit, 32), self._dimension))  # a multiple of 2, 4, ... workers
 
     def tell(self, observations: Sequence[Observation]) -> None:
-        """Remember the best; what was found changes nothing else."""
+        """Remember the best point; later points do not depend on it."""
         for one in observations:
             if np.isfinite(one.score) and (self._lowest is None or one.score < self._lowest.score):
                 self._lowest = one
 
     @property
     def stop_reason(self) -> str:
-        """Never finishes by itself."""
+        """Always empty: it never finishes by itself."""
         return ''
 
     @property
