@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One parameter set tried on all trials, here, in processes or on a cluster; and its residuals."""
+"""Parameter sets evaluated on all trials, in this process, others or a cluster; and their residuals."""
 
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.cluster import ClusterExecutor

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Batch: many parameter sets evaluated in order, here or wherever an executor says.
+BatchEvaluator: many parameter sets evaluated in order, in this process or by an executor.
 
-A simulator lives in the process and the thread that uses it.
+Each process and each thread creates and uses a simulator of its own.
 """
 
 from __future__ import annotations
@@ -24,9 +24,12 @@ from dlo_calibration.model.chain import Floats
 
 class BatchEvaluator:
     """
-    Evaluates batches of points in order, wherever the executor says.
+    Evaluates batches of points in order.
 
     Once stopped, a batch ends early, without an error.
+
+    :param should_stop: asked again and again; True ends the batch.
+    :param executor: runs the evaluations; None: this thread does.
     """
 
     def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
@@ -35,10 +38,10 @@ class BatchEvaluator:
         self._should_stop = should_stop
         self._executor = executor
         self._parcel = _Parcel(evaluator)
-        self._key = uuid.uuid4().hex  # of this calibration, on whichever machines
+        self._key = uuid.uuid4().hex  # identifies this calibration on all machines
 
     def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
-        """Evaluate (k, d) points, the first with the index `first`."""
+        """Yield the evaluations of (k, d) points; the first one has the index `first`."""
         if self._executor is None:
             for k, point in enumerate(points):
                 try:
@@ -47,7 +50,7 @@ class BatchEvaluator:
                     return
             return
         futures: list[Future[Evaluation]] = [
-            self._executor.submit(_evaluate_elsewhere, self._key, self._parcel, first + k, point)
+            self._executor.submit(_evaluate_in_worker, self._key, self._parcel, first + k, point)
             for k, point in enumerate(points)]
         try:
             for future in futures:
@@ -83,19 +86,19 @@ def _wait(future: Future[Evaluation]) -> None:
 
 class _Parcel:
     """
-    An evaluator on its way to workers.
+    An evaluator that is sent to workers.
 
-    It is pickled once, and unpickled where it is opened: trials with thousands of
-    chains take as long for that as to be simulated.
+    It is pickled only once, and each worker unpickles it only once: with thousands of
+    chains, that takes as long as simulating the trials.
     """
 
     def __init__(self, evaluator: Evaluator | None, packed: bytes = b'') -> None:
         self._evaluator, self._packed = evaluator, packed
 
     def open(self) -> Evaluator:
-        """Return the evaluator; here it is the same one, elsewhere a new one."""
+        """Return the evaluator: the original in this process, a copy in a worker process."""
         if self._evaluator is None:
-            self._evaluator = pickle.loads(self._packed)  # noqa: S301  # from the process that began this one
+            self._evaluator = pickle.loads(self._packed)  # noqa: S301  # sent by the parent process
         assert self._evaluator is not None
         return self._evaluator
 
@@ -104,28 +107,28 @@ class _Parcel:
         return _Parcel, (None, self._packed)
 
 
-class _Here(threading.local):
+class _WorkerThread(threading.local):
     """
-    What a worker's thread keeps: the evaluator of the calibration under way.
+    The evaluator that a worker's thread keeps for the current calibration.
 
-    Its simulator is closed when another calibration begins, or the thread ends.
+    Its simulator is closed when another calibration begins or the thread ends.
     """
 
     key = ''
     evaluator: Evaluator
-    forget: Callable[[], object] = staticmethod(lambda: None)
+    close: Callable[[], object] = staticmethod(lambda: None)
 
     def of(self, key: str, parcel: _Parcel) -> Evaluator:
         if key != self.key:
-            self.forget()
+            self.close()
             self.key, self.evaluator = key, copy.copy(parcel.open())
-            self.forget = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
+            self.close = weakref.finalize(self.evaluator, self.evaluator.simulator.close)
         return self.evaluator
 
 
-_here = _Here()
+_worker_thread = _WorkerThread()
 
 
-def _evaluate_elsewhere(key: str, parcel: _Parcel, index: int, point: Floats) -> Evaluation:
-    """Evaluate in a worker, with an evaluator that stays as long as the calibration is the same."""
-    return _here.of(key, parcel).evaluate(index, point)
+def _evaluate_in_worker(key: str, parcel: _Parcel, index: int, point: Floats) -> Evaluation:
+    """Evaluate a point in a worker, which keeps the evaluator of a calibration."""
+    return _worker_thread.of(key, parcel).evaluate(index, point)

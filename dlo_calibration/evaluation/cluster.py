@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cluster: evaluations on the workers of a Dask scheduler, on any number of machines."""
+"""ClusterExecutor: evaluations on the workers of a Dask scheduler, on any number of machines."""
 
 from __future__ import annotations
 
@@ -17,24 +17,20 @@ import warnings
 
 from dlo_calibration.errors import DloCalibrationError, InputError
 
-PATIENCE = 8  # s until a scheduler counts as unreachable
-RETURN = 30.0  # s that a lost worker, or another one, has to come back where it was the last one
-LOOK = 0.5  # s between two looks at the connection
-LEAVING = 2.0  # s that the end waits for a scheduler to hear of it
-LOGGERS = ('distributed', 'distributed.client', 'tornado.application', 'asyncio')  # of Dask, on stderr
-PACKAGE = __name__.partition('.')[0]
+PATIENCE = 8  # s after which a scheduler counts as unreachable
+RETURN = 30.0  # s that we wait for a worker after the last one was lost
 
 
 class ClusterExecutor(Executor):
     """
-    An executor of the workers that a Dask scheduler has.
+    An executor on the workers of a Dask scheduler.
 
-    The workers' machines need this package; that of the scheduler needs Dask alone.
+    This package must be installed where the workers are; the scheduler's machine needs only Dask.
 
     :param address: of the scheduler, e.g. ``tcp://host:8786``.
-    :param on_loss: called with a sentence for each worker that is lost, from any thread.
-    :param on_wait: called with a sentence where there is no worker yet.
-    :raises InputError: where Dask is not installed, or no scheduler answers.
+    :param on_loss: called with a sentence for each lost worker, from any thread.
+    :param on_wait: called with a sentence if there is no worker yet.
+    :raises InputError: if Dask is not installed or no scheduler answers.
     """
 
     def __init__(self, address: str, on_loss: Callable[[str], None] = lambda _: None,
@@ -45,26 +41,26 @@ class ClusterExecutor(Executor):
         except ImportError as error:
             raise InputError(
                 'parameter scheduler', f'{address!r} without the library distributed ({error})',
-                'that library', f"install it with pip install '{PACKAGE}[distributed]'") from error
+                'that library', "install it with pip install 'dlo_calibration[distributed]'") from error
         self._address = address
         self._on_loss = on_loss
         self._closed = threading.Event()
-        self._pending: dict[Future[Any], Future[Any]] = {}  # what has no outcome yet -> Dask's
+        self._pending: dict[Future[Any], Future[Any]] = {}  # future without a result -> Dask's future
         self._given_up: BaseException | None = None
-        self._deadline = float('inf')  # for a worker to be there
+        self._deadline = float('inf')  # [s] by which there must be a worker
         self._silence = _Silence()
         try:
-            # A client that cannot connect tries for long, and complains once more when it is collected.
+            # Try the address first: Dask's client retries for long, and logs an error when it is deleted.
             socket.create_connection(get_address_host_port(address, strict=True), PATIENCE).close()
             with warnings.catch_warnings():
-                warnings.simplefilter('ignore')  # e.g. of other versions at the workers; what fails says so
+                warnings.simplefilter('ignore')  # e.g. about versions of the workers; failures are reported
                 self._client = Client(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
             self._silence.end()
             raise InputError('parameter scheduler', f'{address!r} ({" ".join(str(error).split())})',
                              'the address of a Dask scheduler that answers, such as tcp://host:8786',
                              'start one with: dask scheduler') from error
-        # Without pure=False, Dask would take equal calls of two calibrations for the same one.
+        # Without pure=False, Dask would answer a call with the result of an equal one of another calibration.
         self._executor = self._client.get_executor(pure=False)
         self._client.subscribe_topic('all', self._hear)
         if not self._client.nthreads():
@@ -75,8 +71,8 @@ class ClusterExecutor(Executor):
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
         """Return a future that may be cancelled at any time."""
         future: Future[Any] = Future()
-        # Only bytes and a function of Python go to Dask: a worker that cannot read them, as it lacks a
-        # module, would leave the scheduler without a word, and the scheduler itself need not read them.
+        # Send bytes and a function of Python's library: any worker and the scheduler can unpickle these.  A
+        # worker that fails to unpickle a task, e.g. because a module is missing, leaves without an error.
         there = self._executor.submit(pickle.loads, pickle.dumps(_Call(call, args, keywords)))
         self._pending[future] = there
         future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
@@ -86,31 +82,31 @@ class ClusterExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End when everything submitted is done; at once where it need not wait."""
+        """End when all submitted calls are done; at once if they are cancelled or need not be waited for."""
         if not self._closed.is_set():
             self._executor.shutdown(wait=wait and not cancel_futures)
             self.close()
 
     def close(self) -> None:
-        """Leave now: the scheduler forgets what was submitted."""
+        """Disconnect now: the scheduler drops the submitted calls."""
         if self._closed.is_set():
             return
         self._closed.set()
         leaving = threading.Thread(target=self._leave, name='leaving a scheduler', daemon=True)
         leaving.start()
-        leaving.join(LEAVING)  # one that is gone, or does not answer, must not hold anybody up
+        leaving.join(2.0)  # s; a scheduler that does not answer must not delay the end
 
     def _leave(self) -> None:
         try:
             self._executor.shutdown(wait=False)
             self._client.close(timeout=PATIENCE)
-        except Exception as error:  # the scheduler is gone, and with it what was submitted
+        except Exception as error:  # the scheduler is gone, and the submitted calls with it
             logging.getLogger(__name__).debug('leaving a scheduler: %r', error)
         finally:
             self._silence.end()
 
     def _pass_on(self, future: Future[Any]) -> None:
-        """Give a future what it ended with, in words that say what to do."""
+        """Give a future its result, or an error that says what to do."""
         done = self._pending.get(future)
         if done is None:
             return
@@ -119,32 +115,32 @@ class ClusterExecutor(Executor):
             reason = CancelledError() if self._closed.is_set() else self._explained(error)
             self._fail(future, reason)
             if reason is not error and not self._closed.is_set():
-                self._give_up(reason)  # others might wait for ever, e.g. for workers that were all killed
+                self._give_up(reason)  # other futures might never end, e.g. if all workers were killed
         elif self._pending.pop(future, None) and future.set_running_or_notify_cancel():
             future.set_result(done.result())
 
     def _fail(self, future: Future[Any], error: BaseException) -> None:
-        """End a future, unless it has ended."""
+        """End a future with an error, unless it has ended."""
         if self._pending.pop(future, None) and future.set_running_or_notify_cancel():
             future.set_exception(error)
 
     def _explained(self, error: BaseException) -> BaseException:
+        """Return an error that says what to do in place of one of Dask; any other as it is."""
         from distributed import KilledWorker
 
         if isinstance(error, KilledWorker):
             return DloCalibrationError(
-                f'{error.allowed_failures + 1} workers of the scheduler {self._address} one after the other '
-                'ended unexpectedly at the same evaluation; see their logs, give them more memory, or start '
-                'fewer on a machine')
+                f'{error.allowed_failures + 1} workers of the scheduler {self._address} ended '
+                'unexpectedly, one after the other, at the same evaluation; see their logs, give them more '
+                'memory, or start fewer on each machine')
+        expected = 'dlo_calibration and its engine in the same version everywhere'
         missing = _missing_module(error)
         if missing:
             return InputError(f'scheduler {self._address}', f'a machine without the module {missing}',
-                              f'{PACKAGE} and its engine, the same version everywhere',
-                              f'install {PACKAGE} there, and start the worker again')
+                              expected, 'install dlo_calibration there, and start the worker again')
         if isinstance(error, AttributeError) and str(error).startswith("Can't get attribute"):  # by pickle
-            return InputError(f'scheduler {self._address}', f'a machine with other programs ({error})',
-                              f'{PACKAGE} and its engine, the same version everywhere',
-                              f'install this {PACKAGE} there, and start the worker again')
+            return InputError(f'scheduler {self._address}', f'a machine with another version ({error})',
+                              expected, 'install this dlo_calibration there, and start the worker again')
         if isinstance(error, CancelledError) or type(error).__name__ == 'FutureCancelledError':
             return self._lost()
         return error
@@ -154,22 +150,22 @@ class ClusterExecutor(Executor):
                                    'see its log, and start again')
 
     def _hear(self, event: tuple[float, Mapping[str, Any]]) -> None:
-        """Take an event of the scheduler."""
+        """React to an event of the scheduler."""
         _, content = event
         if content.get('action') == 'remove-worker' and not self._closed.is_set():
-            self._on_loss(f'the scheduler lost the worker {content.get("worker")}; what it did is done again')
+            self._on_loss(f'the scheduler lost the worker {content.get("worker")}; what it did is repeated')
             self._deadline = time.monotonic() + RETURN
 
     def _watch(self) -> None:
-        """Give up where the scheduler or its last worker is lost; the work of a thread."""
-        while not self._closed.wait(LOOK):
-            if self._client.status != 'running':  # Dask has forgotten everything, and tries to connect again
+        """Give up when the scheduler or its last worker is lost; runs in a thread of its own."""
+        while not self._closed.wait(0.5):
+            if self._client.status != 'running':  # Dask has dropped all calls and tries to reconnect
                 return self._give_up(self._lost())
             if time.monotonic() > self._deadline:
                 self._deadline = float('inf')
                 try:
                     workers = self._client.nthreads()
-                except Exception as error:  # it is being lost, which the next look tells
+                except Exception as error:  # the connection is breaking; the next round sees its status
                     logging.getLogger(__name__).debug('asking a scheduler for its workers: %r', error)
                     continue
                 if not workers:
@@ -178,14 +174,14 @@ class ClusterExecutor(Executor):
                         f'{RETURN:g} s; see their logs, give them more memory, and start them again'))
 
     def _give_up(self, reason: BaseException) -> None:
-        """End everything that was submitted, and what will be."""
+        """End all submitted calls, and all later ones, with this error."""
         self._given_up = reason
         for future in list(self._pending):
             self._fail(future, reason)
 
 
 class _Call:
-    """A call that is made where it is unpickled."""
+    """A call that is executed by unpickling it."""
 
     def __init__(self, call: Callable[..., Any], args: tuple[Any, ...], keywords: Mapping[str, Any]) -> None:
         self._made = partial(call, **keywords), args
@@ -195,7 +191,7 @@ class _Call:
 
 
 def _missing_module(error: BaseException | None) -> str:
-    """Return the name of a module that was not found, here or in what caused it; else nothing."""
+    """Return the name of the missing module that caused an error; empty if there is none."""
     while error is not None:
         if isinstance(error, ModuleNotFoundError):
             return error.name or str(error)
@@ -204,11 +200,12 @@ def _missing_module(error: BaseException | None) -> str:
 
 
 class _Silence:
-    """Keeps Dask from writing to stderr, until `end`: a progress bar is there."""
+    """Keeps Dask from writing to stderr until `end`: the progress bar is there."""
 
     def __init__(self) -> None:
-        self._before = {name: logging.getLogger(name).level for name in LOGGERS}
-        for name in LOGGERS:
+        names = ('distributed', 'distributed.client', 'tornado.application', 'asyncio')
+        self._before = {name: logging.getLogger(name).level for name in names}
+        for name in names:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
     def end(self) -> None:

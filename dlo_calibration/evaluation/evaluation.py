@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Evaluation: what one parameter set gave on all trials."""
+"""Evaluation: the result of one parameter set on all trials."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Evaluation:
     """
     One parameter set tried on all trials (the paper calls it a round).
 
-    :param index: 0, 1, ... in the order asked.
+    :param index: 0, 1, ... in the order in which the search asked.
     :param point: (d,) in the unit cube.
     :param values: free parameters on the 0..100 scale.
-    :param scores: difference score of each trial; empty where it failed.
-    :param errors: over all goal points; None where it failed.
+    :param scores: difference score of each trial [cm]; empty if the evaluation failed.
+    :param errors: over all points of all goals; None if the evaluation failed.
     :param residuals: (m,) [m]; kept for the best evaluation only.
-    :param unsettled: names of trials that never came to rest.
-    :param failure: why it failed; empty where it did not.
-    :param skipped: number of trials that were not simulated any more, as one before them failed.
+    :param unsettled: names of the trials in which the DLO never came to rest.
+    :param failure: why the evaluation failed; empty if it did not.
+    :param skipped: number of trials that were not simulated because an earlier one failed.
     """
 
     index: int
@@ -42,5 +42,5 @@ class Evaluation:
 
     @property
     def score(self) -> float:
-        """Average difference score over the trials [cm]; infinite where it failed."""
+        """Average difference score over the trials [cm]; infinite if the evaluation failed."""
         return float(np.mean(self.scores)) if self.scores else float('inf')

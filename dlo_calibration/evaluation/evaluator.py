@@ -22,7 +22,7 @@ from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 
 def mean_length(trials: Sequence[Trial]) -> float:
-    """Return the mean length of the DLO as the trials begin [m]."""
+    """Return the mean length [m] of the initial chains of the trials."""
     return float(np.mean([trial.initial.length for trial in trials]))
 
 
@@ -30,7 +30,7 @@ class Evaluator:
     """
     Tries parameter sets on trials.
 
-    It is pickled to worker processes and copied for worker threads: see `Simulator`.
+    Worker processes get a pickled one and worker threads a copy; see `Simulator`.
     """
 
     def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
@@ -41,7 +41,7 @@ class Evaluator:
         self._scores = tuple(TrialScore(trial) for trial in trials)
 
     def __copy__(self) -> Evaluator:
-        """Return one with a simulator of its own."""
+        """Return an evaluator with a simulator of its own."""
         return Evaluator(self.trials, self.space, copy.copy(self.simulator))
 
     def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
@@ -54,7 +54,7 @@ class Evaluator:
         """
         Try a (d,) point of the unit cube on every trial.
 
-        :raises CancelledError: as soon as `should_stop` says so, between trials.
+        :raises CancelledError: if `should_stop` is True before a trial.
         """
         point = frozen_array(point)
         evaluation = Evaluation(index, point, self.space.values(point))

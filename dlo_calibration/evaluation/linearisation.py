@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
 
-STEP = 0.03  # of a difference, in the unit cube; contacts that come and go change the residuals over less
-WIDEST = 0.25  # of a difference, even where a parameter is known no better: a quarter of its scale
-RIDGE = 1e-9  # of the trace of the information: enough that a parameter without effect stays where it is
-TINY = float(np.finfo(float).tiny)  # in place of a zero that is divided by
+# Steps of finite differences, in the unit cube:
+STEP = 0.03  # usual; over shorter ones, contacts that come and go dominate the residuals
+WIDEST = 0.25  # largest, for parameters that are hardly known; the linear model holds no further
+TINY = float(np.finfo(float).tiny)  # keeps a divisor above zero
 
 
 @dataclass(frozen=True)
 class Linearisation:
     """
-    A linear model of the residuals.
+    A linear model of the residuals near a point.
 
     :param point: (d,) in the unit cube.
-    :param residuals: (m,) [m] there.
-    :param jacobian: (m, d) their derivative by the parameters [m per unit cube].
+    :param residuals: (m,) [m] at that point.
+    :param jacobian: (m, d) derivatives of the residuals by the parameters [m per unit cube].
     """
 
     point: Floats
@@ -35,29 +35,29 @@ class Linearisation:
 
     @property
     def information(self) -> Floats:
-        """(d, d) J^T J."""
+        """The (d, d) information J^T J [m^2], for a unit noise level."""
         return information(self.jacobian)
 
     @property
     def gradient(self) -> Floats:
-        """(d,) J^T r, of half the sum of squares."""
+        """The (d,) gradient J^T r [m^2] of half the sum of squared residuals."""
         return np.asarray(self.jacobian.T @ self.residuals)
 
     @property
     def ridge(self) -> Floats:
-        """(d, d) a prior information that is next to nothing."""
-        return np.eye(len(self.point)) * max(RIDGE * float(np.trace(self.information)), TINY)
+        """A very weak (d, d) prior information, which keeps a parameter without effect where it is."""
+        return np.eye(len(self.point)) * max(1e-9 * float(np.trace(self.information)), TINY)
 
     def weighted(self, weights: Floats) -> Linearisation:
-        """Return it with each residual and its derivatives times one of (m,) weights."""
+        """Return the model with each residual and its derivatives multiplied by its weight, (m,)."""
         return Linearisation(self.point, weights * self.residuals, weights[:, None] * self.jacobian)
 
     def rows(self, rows: slice) -> Linearisation:
-        """Return that of some of the residuals."""
+        """Return the model of some of the residuals."""
         return Linearisation(self.point, self.residuals[rows], self.jacobian[rows])
 
     def columns(self, columns: NDArray[np.intp] | NDArray[np.bool_]) -> Linearisation:
-        """Return that of some of the parameters; the others stay where they are."""
+        """Return the model in some of the parameters; the others are fixed."""
         return Linearisation(self.point[columns], self.residuals, self.jacobian[:, columns])
 
     def predicted(self, step: Floats) -> Floats:
@@ -66,43 +66,43 @@ class Linearisation:
 
     def step(self, prior: Floats | None = None) -> Floats:
         """
-        Return the (d,) Gauss-Newton step to the lowest sum of squares.
+        Return the (d,) Gauss-Newton step to the least sum of squared residuals.
 
-        :param prior: (d, d) added to the information; None: nothing is.
+        :param prior: (d, d) prior information that is added; None: no prior.
         """
         if prior is None:
             return np.asarray(np.linalg.lstsq(self.jacobian, -self.residuals, rcond=None)[0])
         return np.asarray(-np.linalg.solve(self.information + prior, self.gradient))
 
     def own_weights(self, k: int) -> Floats:
-        """Return (m,) weights that sum up a change of the residuals to how far k moved, not the others."""
+        """Return (m,) weights that turn a change of the residuals into the change of parameter k alone."""
         own = perpendicular(np.delete(self.jacobian, k, axis=1), self.jacobian[:, k])
         return np.asarray(own / max(float(own @ own), TINY))
 
 
 def information(jacobian: Floats, scale: float = 1.0) -> Floats:
-    """Return the (d, d) information J^T J / scale^2 of (m, d) derivatives; `scale` [m] is the error."""
+    """Return the (d, d) information J^T J / scale^2 of an (m, d) Jacobian; `scale` [m] is the noise level."""
     return np.asarray(jacobian.T @ jacobian / scale**2)
 
 
 def standard_deviations(known: Floats) -> Floats:
-    """Return the (d,) standard deviations that a (d, d) information leaves."""
+    """Return the (d,) standard deviations of the posterior with a (d, d) information."""
     return np.sqrt(np.diag(np.linalg.inv(known)))
 
 
 def perpendicular(columns: Floats, vector: Floats) -> Floats:
-    """Return the part of an (m,) vector that no combination of (m, k) columns has."""
+    """Return the part of an (m,) vector that is perpendicular to (m, k) columns."""
     basis, _ = np.linalg.qr(columns)
     return np.asarray(vector - basis @ (basis.T @ vector))
 
 
 def inward(point: Floats, steps: Floats) -> Floats:
-    """Return (d,) steps from a (d,) point, turned round where they would leave the unit cube."""
+    """Return (d,) steps from a (d,) point, with the sign changed where they would leave the unit cube."""
     return np.where((point + steps > 1) | (point + steps < 0), -steps, steps)
 
 
 def both_sides(point: Floats, columns: Iterable[int | np.intp], steps: Floats) -> Floats:
-    """Return the points below and above a (d,) point in each of k parameters, (2 k, d) in the unit cube."""
+    """Return (2 k, d) points below and above a (d,) point in each of k parameters, within the unit cube."""
     beside = []
     for k in columns:
         for step in (-steps[k], steps[k]):
@@ -113,10 +113,10 @@ def both_sides(point: Floats, columns: Iterable[int | np.intp], steps: Floats) -
 
 def slope(values: Iterable[float], seen: Sequence[Floats | None]) -> Floats | None:
     """
-    Return the (m,) derivative between the outermost of some values of a parameter.
+    Return the (m,) difference quotient between the smallest and the largest value of a parameter.
 
-    :param seen: (m,) what each gave, or None where it could not be simulated.
-    :returns: None where fewer than two different ones could be.
+    :param seen: the (m,) residuals at each value; None if the simulation failed, and the value is left out.
+    :returns: None if fewer than two different values are left.
     """
     known = [(float(value), one) for value, one in zip(values, seen, strict=True) if one is not None]
     if not known:

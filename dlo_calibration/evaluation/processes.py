@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Processes that simulate: they end with whoever started them, at once, however that one ends.
+ProcessExecutor: processes that simulate.
 
-One that dies is replaced, and what it was doing is done again.
+They end as soon as the process that started them ends, for whatever reason.  A process that
+dies is replaced, and its call is repeated.
 """
 
 from __future__ import annotations
@@ -28,8 +29,7 @@ from typing import Any, Callable, Iterator, Mapping
 from dlo_calibration.errors import DloCalibrationError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-DEATHS = 3  # of processes at the same work, after which it is given up
-NICENESS = 5  # what answers the user, e.g. a node, comes before what simulates
+DEATHS = 3  # processes that may die at the same call before it fails
 _starting = threading.Lock()
 
 
@@ -42,11 +42,11 @@ class ProcessExecutor(Executor):
     """
     An executor of `workers` fresh processes; 0: one per core.
 
-    They start at once, and end by `close`, or when the parent is gone.  They
-    ignore SIGINT and SIGTERM, so that Ctrl-C reaches the one who knows what to
-    do about it.  They do not import the main module: nothing defined there can
-    be sent.  A process that dies is replaced, and its call is made again; at
-    which `DEATHS` of them died ends with a `DloCalibrationError`.
+    They start at once, and end by `close` or with the parent process.  They
+    ignore SIGINT and SIGTERM: the parent handles these.  They do not import the
+    main module, so nothing that is defined there can be sent to them.  A process
+    that dies is replaced and its call is repeated; a call at which `DEATHS`
+    processes died ends with a `DloCalibrationError`.
 
     :param on_death: called with a sentence for each death, from any thread.
     """
@@ -56,8 +56,8 @@ class ProcessExecutor(Executor):
         self._on_death = on_death
         self._closed = threading.Event()
         self._processes: dict[_Process, connection.Connection] = {}
-        self._changing = threading.Lock()  # of the processes
-        # Python would wait for ever for processes that ignore the SIGTERM it sends them at its end.
+        self._changing = threading.Lock()  # guards `_processes`
+        # At exit, Python would send SIGTERM, which the processes ignore, and wait for them for ever.
         atexit.register(self.close)
         first = []
         try:
@@ -80,7 +80,7 @@ class ProcessExecutor(Executor):
         return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End when everything submitted is done."""
+        """End when all submitted calls are done."""
         if cancel_futures:
             self._cancel_waiting()
         for _ in self._threads:
@@ -91,7 +91,7 @@ class ProcessExecutor(Executor):
             atexit.unregister(self.close)
 
     def close(self) -> None:
-        """End the processes now, whatever they are doing."""
+        """Kill the processes now; calls under way are cancelled."""
         self._closed.set()
         atexit.unregister(self.close)
         self._cancel_waiting()
@@ -132,13 +132,13 @@ class ProcessExecutor(Executor):
             return process
 
     def _end(self, process: _Process) -> None:
-        """Forget a process that ends or has ended."""
+        """Close the connection to a process, and wait for its end."""
         with self._changing:
             self._processes.pop(process).close()
         process.join()
 
     def _serve(self, process: _Process | None) -> None:
-        """Let one process after the other do what waits; the work of a thread."""
+        """Pass waiting tasks to a process, replacing it when it dies; runs in a thread per process."""
         while (task := self._tasks.get()) is not None:
             if task.future.set_running_or_notify_cancel():
                 process = self._do(task, process)
@@ -146,7 +146,7 @@ class ProcessExecutor(Executor):
             self._end(process)
 
     def _do(self, task: _Task, process: _Process | None) -> _Process | None:
-        """Give the future of a task its outcome; return the process for the next one, if one lives."""
+        """Give the future of a task its result or error; return the process if it still lives."""
         deaths = 0
         while True:
             try:
@@ -161,13 +161,13 @@ class ProcessExecutor(Executor):
                 if self._closed.is_set():
                     task.future.set_exception(CancelledError())
                     return None
-                self._on_death(f'a process that simulates {ending}; what it did is done again')
+                self._on_death(f'a process that simulates {ending}; its evaluation is repeated')
                 if deaths == DEATHS:
                     task.future.set_exception(DloCalibrationError(
                         f'{DEATHS} processes one after the other ended unexpectedly at the same evaluation, '
                         f'the last one {ending}; free memory, or use fewer workers'))
                     return None
-            except BaseException as error:  # there is no new process, or what cannot be sent
+            except BaseException as error:  # no new process could start, or the call cannot be pickled
                 task.future.set_exception(error)
                 return process
             else:
@@ -187,20 +187,20 @@ class _Task:
 
 
 def _ending(code: int | None) -> str:
-    """Say how a process ended, by its exit code."""
+    """Return in words how a process with this exit code ended."""
     if code is not None and code < 0:
         killed = f'was killed by {signal.Signals(-code).name}'
-        return f'{killed}, as where memory runs out' if code == -signal.SIGKILL else killed
+        return f'{killed}, as happens when memory runs out' if code == -signal.SIGKILL else killed
     return f'ended unexpectedly with exit code {code}'
 
 
 class _Process(SpawnProcess):
-    """A spawned process that starts deaf to signals and without the parent's main module."""
+    """A spawned process that starts with signals blocked and without the parent's main module."""
 
     def start(self) -> None:
-        # The first start of all starts Python's resource tracker, too, which ends by unblocking signals.
+        # Start Python's resource tracker first: starting it later would unblock the signals again.
         resource_tracker.ensure_running()
-        # The main module may be one that loads rclpy; a child needs nothing from it.
+        # The main module may load rclpy, which a child does not need.
         with _starting, _blocked_signals():
             main = sys.modules['__main__']
             sys.modules['__main__'] = types.ModuleType('__main__')
@@ -221,7 +221,7 @@ def _blocked_signals() -> Iterator[None]:
 
 
 def _work(channel: connection.Connection) -> None:
-    """Answer calls until the parent hangs up; the work of a process."""
+    """Execute calls until the parent closes the connection; the main function of a process."""
     _begin()
     while True:
         try:
@@ -234,7 +234,7 @@ def _work(channel: connection.Connection) -> None:
 
 
 def _sendable(error: BaseException) -> BaseException:
-    """Return an error that another process can read, with its traceback as a note."""
+    """Return an error that can be unpickled elsewhere, with its traceback as a note."""
     text = ''.join(traceback.format_exception(error))
     try:
         error.add_note(f'In a process that simulates:\n{text}')
@@ -245,11 +245,11 @@ def _sendable(error: BaseException) -> BaseException:
 
 
 def _begin() -> None:
-    """Prepare a process that simulates."""
+    """Ignore SIGINT and SIGTERM, lower the priority, and end with the parent."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    os.nice(NICENESS)
+    os.nice(5)  # the node or the terminal that the user waits for comes first
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -129,7 +129,7 @@ def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(tmp_pat
     (tmp_path / 'toy_simulator.py').touch()
     with running(tmp_path, 0) as (address, processes):
         for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
-                            (tmp_path, "other programs .*'ToySimulator'.* the same version everywhere")):
+                            (tmp_path, "another version .*'ToySimulator'.* the same version everywhere")):
             worker = dask('worker', address, '--no-nanny', '--nthreads', '1',
                           PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
             processes.append(worker)
