@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How a trial is simulated: what an engine is, the nodes of the DLO, the course of a rollout.
+Simulate a trial: the interface of engines, the nodes of the DLO, the course of a rollout.
 
-The engines themselves are in `bullet` and `compiled`, the physics of both in `kernels`; they are imported
-where they are used, as they take long to load.
+The engines are in `bullet` and `compiled`, the physics of both in `kernels`.  Import them where they are
+used, because they take long to load.
 """
 
 from dlo_calibration.simulation.nodes import NodeLayout

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The PyBullet engine: a rope in any PyBullet world, and trials simulated with it.
+The PyBullet engine: a rope for any PyBullet world, and a simulator of trials that uses it.
 
-The rope's nodes are spheres.  Each step, `kernels` give their velocities from the
-internal forces, gravity and the rope's contact with itself, and Bullet does contact
-and friction with everything else.
+The rope's nodes are spheres.  In each step, `kernels` compute their velocities from
+internal forces, gravity and the rope's contact with itself; Bullet adds contact and
+friction with all other bodies.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from dlo_calibration.simulation.rope import diverged, Rope
 @contextmanager
 def _silence() -> Iterator[None]:
     """Keep native code from writing to stdout and stderr."""
-    flush = ctypes.CDLL(None).fflush  # C buffers what it writes to a pipe
+    flush = ctypes.CDLL(None).fflush  # of C, which buffers output to a pipe
     flush(None)
     kept, nowhere = (os.dup(1), os.dup(2)), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -46,12 +46,10 @@ def _silence() -> Iterator[None]:
         os.close(nowhere)
 
 
-with _silence():  # it greets every process with its build time, in the middle of a progress bar
+with _silence():  # at import it prints its build time, also in the middle of a progress bar
     import pybullet
 
-ROPE_GROUP = 1 << 6  # collision group whose members do not collide with each other in Bullet
-NO_TURN = (0.0, 0.0, 0.0, 1.0)
-INERTIA = 1e6  # kg m^2: spheres slide, they do not roll
+IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
 
 
 class BulletRope:
@@ -59,24 +57,24 @@ class BulletRope:
     A calibrated rope in a PyBullet world, beside robots and obstacles.
 
     The world's own gravity and time step apply to it.  Friction with another
-    body is Bullet's product of both coefficients, so a table that the rope was
-    calibrated on has `lateralFriction` 1.  Call `step` in place of
-    `pybullet.stepSimulation`; or `before_step` and `after_step` around it.
+    body is the product of both coefficients in Bullet: give the table of the
+    calibration `lateralFriction` 1.  Call `step` in place of
+    `pybullet.stepSimulation`, or `before_step` and `after_step` around it.
 
     :param client: id of the PyBullet client.
-    :param places: (N,) [m] of the nodes along the rope at rest, from 0, increasing.
-    :param points: (N, 3) [m] of the nodes at the start.
+    :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing.
+    :param points: (N, 3) [m] positions of the nodes at the start.
     :param physical: physical values by parameter name, in SI units.
-    :param radius: [m] at which it touches other bodies; None: its self-collision radius.
+    :param radius: [m] for contact with other bodies; None: the self-collision radius.
     :param velocities: (N, 3) [m/s] at the start; None: at rest.
-    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
-    :param group: collision group of its own, one bit; two ropes that should
-        touch each other need two.
+    :param features: (N,) number of points annotated as feature at each node; None: there are none.
+    :param group: collision group, one bit; its bodies do not touch each other in Bullet.  Two
+        ropes that should touch each other need different groups.
     """
 
     def __init__(self, client: int, places: Floats, points: Floats, physical: Mapping[str, float], *,
                  radius: float | None = None, velocities: Floats | None = None,
-                 features: Floats | None = None, group: int = ROPE_GROUP) -> None:
+                 features: Floats | None = None, group: int = 1 << 6) -> None:
         self._client = client
         world = pybullet.getPhysicsEngineParameters(physicsClientId=client)
         self.time_step: float = world['fixedTimeStep']
@@ -97,23 +95,24 @@ class BulletRope:
     @classmethod
     def of(cls, client: int, chain: Chain, physical: Mapping[str, float], *, nodes: int = DEFAULT_NODES,
            **rest: Any) -> BulletRope:
-        """Put a rope where an observed chain is, with a marker where it is annotated as feature."""
+        """Return a rope at an observed chain, with a marker at each point annotated as feature."""
         places = spread_places(np.array([0.0, chain.length]), nodes)
         rest.setdefault('features', feature_shares(chain, places))
         return cls(client, places, chain.resample(places), physical, **rest)
 
     def reset(self, places: Floats, points: Floats, physical: Mapping[str, float],
               velocities: Floats | None = None, features: Floats | None = None) -> None:
-        """Start anew, with other properties, without building anything in the world."""
+        """Start again with other properties, but with the same bodies in the world."""
         assert len(places) == len(points) == len(self.bodies)
         velocities = np.zeros((len(places), 3)) if velocities is None else velocities
         self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features)
         state = self._rope.state
         for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
             pybullet.changeDynamics(
-                body, -1, mass=mass, localInertiaDiagonal=[INERTIA] * 3, lateralFriction=physical['friction'],
+                body, -1, mass=mass, lateralFriction=physical['friction'],
+                localInertiaDiagonal=[1e6] * 3,  # kg m^2: so large that spheres slide and do not roll
                 restitution=0.0, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client)
-            pybullet.resetBasePositionAndOrientation(body, point, NO_TURN, physicsClientId=self._client)
+            pybullet.resetBasePositionAndOrientation(body, point, IDENTITY, physicsClientId=self._client)
         self.hold(())
 
     @property
@@ -122,7 +121,7 @@ class BulletRope:
         return self._rope.points
 
     def hold(self, nodes: Sequence[int]) -> None:
-        """Hold exactly these nodes from now on; none: let go."""
+        """Hold exactly these nodes from now on; an empty sequence releases the rope."""
         self._rope.hold(tuple(dict.fromkeys(int(node) for node in nodes)))
         self._targets = self._rope.state.points[self._rope.state.rod.held]
 
@@ -134,39 +133,39 @@ class BulletRope:
 
     def before_step(self, targets: Floats | None = None) -> None:
         """
-        Give the nodes the velocities that internal forces and gravity cause.
+        Give the nodes the velocities due to internal forces, gravity and self-contact.
 
-        :param targets: (h, 3) [m] where the held nodes are after the step;
-            None: where they were.
-        :raises SimulationError: where the rollout diverges.
+        :param targets: (h, 3) [m] positions of the held nodes after the step;
+            None: they stay.
+        :raises SimulationError: if the rollout diverges.
         """
         state = self._rope.state
         if targets is not None:
             self._targets = np.array(targets, dtype=float)
-        if not kernels.want(state, self._targets):
+        if not kernels.predict_velocities(state, self._targets):
             raise diverged()
-        sent = state.wanted - self._gravity * self.time_step  # Bullet adds it again
+        sent = state.predicted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client
         for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
             pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
 
     def after_step(self) -> None:
-        """Take the positions and velocities that contacts left."""
+        """Read positions and velocities after contact from Bullet."""
         client, state = self._client, self._rope.state
         for node, target in zip(state.rod.held, self._targets.tolist(), strict=True):
-            pybullet.resetBasePositionAndOrientation(self.bodies[node], target, NO_TURN,
+            pybullet.resetBasePositionAndOrientation(self.bodies[node], target, IDENTITY,
                                                      physicsClientId=client)
         points = np.array([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0]
                            for body in self.bodies])
         state.velocities[:] = (points - state.points) / self.time_step
-        state.support[:] = state.velocities - state.wanted
+        state.support[:] = state.velocities - state.predicted
         state.points[:] = points
 
     def advance(self, targets: Floats, path: Floats | None = None) -> None:
         """
-        Take k steps; targets (k, h, 3) [m] of the held nodes after each.
+        Take k steps; `targets` are the (k, h, 3) [m] positions of the held nodes after each.
 
-        :param path: (k, N, 3) to write all nodes to after each step [m].
+        :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
         """
         for k, target in enumerate(targets):
             self.step(target)
@@ -180,7 +179,7 @@ class BulletRope:
 
 
 def _add_obstacle(client: int, obstacle: Obstacle) -> None:
-    """Put an obstacle into a world."""
+    """Add an obstacle to a world."""
     sizes = obstacle.sizes.tolist()
     shape = pybullet.createCollisionShape(physicsClientId=client, **{
         'box': {'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]},
@@ -199,9 +198,9 @@ def _add_obstacle(client: int, obstacle: Obstacle) -> None:
 
 def _obstacles(scene: str) -> tuple[Obstacle, ...]:
     """
-    Return the obstacles of a scene, after trying to build them.
+    Return the obstacles of a scene, and try to build them.
 
-    :raises InputError: where the file cannot be used.
+    :raises InputError: if the file cannot be used.
     """
     found = read_scene(scene)
     client = pybullet.connect(pybullet.DIRECT)
@@ -220,18 +219,16 @@ def _obstacles(scene: str) -> tuple[Obstacle, ...]:
 
 class BulletSimulator(Engine):
     """
-    Simulates trials in a PyBullet world of its own: the rope, a table or none, and a scene or none.
+    Simulates trials in a PyBullet world of its own: a rope, perhaps a table and a scene.
 
-    The world is built at the first trial and reset for every other.
-
-    Obstacles of a scene stay where they are, and the rope touches them with the
-    radius that is tried.  Bullet cannot change the radius of a sphere, so the
-    world is built anew for every other radius: about 20 ms, and what reading
-    the scene's meshes takes.
+    The first trial builds the world; the others reset it.  The obstacles of a scene do
+    not move.  The rope touches them with the evaluated radius; as Bullet cannot change
+    the radius of a sphere, each new radius builds the world again: about 20 ms, plus the
+    time to read the meshes.
 
     :param scene: path of a URDF file with fixed obstacles; empty: none.
     :param settings: see `Engine`.
-    :raises InputError: where the scene cannot be used.
+    :raises InputError: if the scene cannot be used.
     """
 
     name = 'bullet'
@@ -251,7 +248,7 @@ class BulletSimulator(Engine):
         return self._world.start(layout, points, physical, level)
 
     def close(self) -> None:
-        """Forget the trials, and end the PyBullet client; the next trial starts another."""
+        """Drop what is known of the trials, and end the PyBullet client; the next trial starts another."""
         super().close()
         self._end()
 
@@ -261,7 +258,7 @@ class BulletSimulator(Engine):
             self._world = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the PyBullet client behind, too: it belongs to this process."""
+        """Leave out the PyBullet client, too: it belongs to this process."""
         return {**super().__getstate__(), '_world': None}
 
 
@@ -269,11 +266,11 @@ class _World:
     """
     A PyBullet client with a rope, a plane and obstacles.
 
-    :param radius: [m] at which the rope touches them; the plane is placed to suit it.
+    :param radius: [m] of the rope's spheres; the plane is placed to suit it.
     """
 
-    SPHERE = 0.005  # m; the radius where there is a plane only
-    AWAY = -1e3  # m: where there is no table
+    SPHERE = 0.005  # m; the radius if there is only a plane: one world does for all trials
+    AWAY = -1e3  # m; height of the plane where nothing can touch it
 
     def __init__(self, layout: NodeLayout, physical: Mapping[str, float], time_step: float, radius: float,
                  obstacles: Sequence[Obstacle]) -> None:
@@ -296,9 +293,9 @@ class _World:
 
     def start(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               touching: float | None) -> BulletRope:
-        """Place rope and table; `touching` [m] is the height of the rope's middle on the table."""
+        """Place rope and table; `touching` [m] is the height of nodes that touch the table."""
         height = self.AWAY if touching is None else touching - self.radius
-        # Bullet keeps contact points from step to step; a step without any forgets the last trial's.
+        # Bullet keeps contact points between steps; a step without contact drops those of the last trial.
         self._place_table(self.AWAY)
         if self._among_obstacles:
             self._rope.reset(layout.places, points + (0, 0, -self.AWAY), physical)
@@ -308,7 +305,7 @@ class _World:
         return self._rope
 
     def _place_table(self, height: float) -> None:
-        pybullet.resetBasePositionAndOrientation(self._plane, [0, 0, height], NO_TURN,
+        pybullet.resetBasePositionAndOrientation(self._plane, [0, 0, height], IDENTITY,
                                                  physicsClientId=self._client)
 
     def close(self) -> None:

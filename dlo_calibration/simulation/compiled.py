@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The compiled engine: the rope of `bullet` with a contact of its own, for a table or none.
+The compiled engine: the same rope as in `bullet`, with its own contact with a table.
 
-Same kernels, table, grips, stable test and time step as the PyBullet engine, without a call
-into another library for each node and step.
+Kernels, table, grips, the test of stability and the time step are those of the PyBullet engine.
+It is faster because no call into another library is needed for each node and step.
 """
 
 from __future__ import annotations
@@ -21,9 +21,6 @@ from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rope import diverged, Rope
 
-NO_PATH = np.empty((0, 0, 3))
-NOWHERE = -1e6  # m: where there is no table
-
 
 class CompiledRope(Rope):
     """
@@ -37,15 +34,16 @@ class CompiledRope(Rope):
         super().__init__(places, points, velocities, physical, time_step, np.array([0.0, 0.0, -GRAVITY]),
                          features)
         self.time_step = time_step
-        self._level = NOWHERE if level is None else level
+        self._level = -1e6 if level is None else level  # so low that nothing touches it
 
-    def advance(self, targets: Floats, path: Floats = NO_PATH) -> None:
+    def advance(self, targets: Floats, path: Floats | None = None) -> None:
         """
-        Take k steps; targets (k, h, 3) [m] of the held nodes after each.
+        Take k steps; `targets` are the (k, h, 3) [m] positions of the held nodes after each.
 
-        :param path: (k, N, 3) to write all nodes to after each step [m]; or empty.
-        :raises SimulationError: where the rollout diverges; at that step.
+        :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
+        :raises SimulationError: if the rollout diverges.
         """
+        path = np.empty((0, 0, 3)) if path is None else path
         if kernels.advance(self.state, np.ascontiguousarray(targets), self._level, path) < len(targets):
             raise diverged()
 

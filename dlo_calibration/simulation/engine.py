@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Engine: what the simulators of trials share, whatever steps their rope."""
+"""Engine: the common part of both simulators; each adds its own rope."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Engine:
     """
     Simulates trials on a table or in the air.
 
-    The table is placed so that the rope rests on it at the measured height, whatever
-    radius is tried, so that a radius neither kicks it up nor lets it fall.
+    The table is placed so that the rope rests on it at the measured height for every
+    evaluated radius: no radius throws the rope up or lets it fall.
 
     :param table: whether there is a table.
-    :param table_height: [m].
-    :param nodes: of the rope.
+    :param table_height: height of the table [m].
+    :param nodes: number of nodes of the rope.
     :param time_step: [s].
     :param stable_distance: see `Settling` [m].
     :param stable_time: see `Settling` [s].
@@ -44,14 +44,14 @@ class Engine:
         self._known: dict[int, tuple[Trial, NodeLayout, float | None]] = {}
 
     def prepare(self) -> None:
-        """Do nothing: the kernels were compiled, or taken from the cache, when they were imported."""
+        """Do nothing: importing the kernels has compiled them or loaded them from the cache."""
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """
         Simulate a trial with physical parameters by name (SI units).
 
-        :raises SimulationError: where the rollout diverges.
-        :raises InputError: where the trial grips more points than there are nodes.
+        :raises SimulationError: if the rollout diverges.
+        :raises InputError: if the trial grips more points than there are nodes.
         """
         layout, level = self._layout(trial)
         points = layout.points
@@ -62,7 +62,7 @@ class Engine:
         return roll_out(trial, layout, self._rope(layout, points, physical, level), self._settling)
 
     def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None]:
-        """Return what depends on the trial alone."""
+        """Return the nodes of a trial and the height [m] of nodes on the table; None: unknown or no table."""
         if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
             level = None if self._table_height is None else resting_level(trial, self._table_height)
             self._known[id(trial)] = trial, NodeLayout.of(trial, self._nodes), level
@@ -71,23 +71,23 @@ class Engine:
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> Stepper:
         """
-        Return a rope at its start.
+        Return a rope at the start of a trial.
 
-        :param points: (N, 3) [m] where its nodes are.
+        :param points: (N, 3) [m] positions of its nodes.
         :param level: height [m] of nodes that touch the table; None: no table.
         """
         raise NotImplementedError
 
     def refined(self) -> Self:
-        """Return one with twice the segments and half the time step."""
+        """Return an engine with twice the segments and half the time step."""
         finer = copy.copy(self)
         finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
         return finer
 
     def close(self) -> None:
-        """Forget the trials."""
+        """Drop what is known of the trials."""
         self._known.clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave behind what belongs to this process."""
+        """Leave out what belongs to this process."""
         return {**self.__dict__, '_known': {}}

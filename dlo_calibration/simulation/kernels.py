@@ -4,10 +4,10 @@
 """
 Kernels: the physics of a DLO, compiled by Numba.
 
-The rod and what bends it, twist between clamps, contact of a DLO with itself, and a table
-with friction.  The machine code is kept in Numba's cache, so that it is compiled once a
-machine.  All kernels are in one file, because a change of this file is all that the cache
-looks at.
+They compute the rod's internal forces with natural curvature and twist, contact of the DLO
+with itself, and a table with friction.  Numba's cache keeps the machine code, so that it is
+compiled once per machine.  All kernels are in one file because the cache notices only
+changes of the file that a kernel is in, not of the kernels that it calls.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dlo_calibration.model.chain import Floats
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
 
-# How a signature says the number of axes:
+# Annotations that tell the number of axes:
 Vector = Floats
 Matrix = Floats
 Cube = Floats
@@ -31,102 +31,96 @@ Indices = NDArray[np.int64]
 Spans = NDArray[np.void]
 Contacts = NDArray[np.void]
 IndexRows = NDArray[np.int64]
-#: type that a kernel is compiled for, by the annotation
+#: annotation -> the type that a kernel is compiled for
 TYPES: dict[str, Any] = {
     'None': numba.void, 'bool': numba.boolean, 'int': numba.int64, 'float': numba.float64,
     'Vector': numba.float64[::1], 'Matrix': numba.float64[:, ::1], 'Cube': numba.float64[:, :, ::1],
     'Indices': numba.int64[::1], 'IndexRows': numba.int64[:, ::1]}
 
-HELD = 1e12  # a held node's share of the matrix, relative to its mass
-ROUNDED = 0.05  # rad of the bends in all below which the direction of the natural curvature is not settled
-HAIRPIN = 0.01  # least squared cosine of half the angle between two segments
-TINY = 1e-12  # m or m/s; a smaller vector has no direction
+HELD = 1e12  # weight of the equation that gives a held node its velocity, relative to its mass
+ROUNDED = 0.05  # rad; mean bend below which the energy of natural curvature is rounded off
+HAIRPIN = 0.01  # least squared cosine of half the angle between two segments: limits divisions
+TINY = 1e-12  # m or m/s; shorter vectors have no direction
 
 # Contact of a DLO with itself:
-ITERATIONS = 10
-PUSH_OUT = 0.8  # share of a penetration that one step removes
-FASTEST_PUSH_OUT = 0.8  # m/s, so that nothing is kicked
-SUPPORTED = 0.5  # cosine between a push and the support against it
-UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding
-WEDGED = 0.1  # a pair of which less than that share can yield is wedged: then all of it does
-STRETCH = 1.2  # how much longer than at rest a segment may be for its pairs to be found
-SKIN = 0.004  # m; pairs that near are watched until the nodes may have moved that far
+ITERATIONS = 10  # of the contact solver, as many as Bullet makes
+PUSH_OUT = 0.8  # share of a penetration that one step corrects
+FASTEST_PUSH_OUT = 0.8  # m/s; limits that correction, so that it does not throw the DLO apart
+SUPPORTED = 0.5  # cosine between a push and the opposing support from which on the node is supported
+UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
+WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
+SKIN = 0.004  # m; pairs within this gap are checked until nodes may have moved this far
 
-# Bullet's treatment of a contact, as found by single steps of a sphere on a plane (PyBullet 3.2.7):
-SLOP = 1e-5  # m that it lets a contact penetrate
-PUSHED_OUT = 0.08  # share of a deeper penetration that one step removes
-MARGIN = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
-
-BAND = 7  # entries of a column of the matrix: node i couples to i + 2, three coordinates each
+BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
 
 
-def _state(record: Any) -> Any:
-    """Let kernels take a named tuple whose fields have the types that its annotations say."""
+def _record(record: Any) -> Any:
+    """Let kernels take a named tuple; its annotations give the types of its fields."""
     make: Any = numba.types.NamedTuple
     TYPES[record.__name__] = make([TYPES[word.__forward_arg__] for word in record.__annotations__.values()],
                                   record)
     return record
 
 
-# Numba counts references to all arrays of a record that a kernel is called with, and to a field that
-# is taken out.  So fields are taken out before a loop, and a step calls with few records.
+# Numba counts references to all arrays of a record that is passed, and to each field that is read.  So
+# kernels read fields before a loop, and pass few records in each step.
 
 
 def _part(kernel: Kernel) -> Kernel:
-    """Compile as a part of the kernels that call it."""
+    """Compile a function together with the kernels that call it."""
     compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy')
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
 def _compiled(kernel: Kernel) -> Kernel:
-    """Compile at import, or take it from the cache: a rollout never waits for the compiler."""
+    """Compile a kernel at import, or load it from the cache: a rollout never waits for the compiler."""
     *arguments, returned = (TYPES[word] for word in kernel.__annotations__.values())
     compile_: Any = numba.njit(returned(*arguments), cache=True, nogil=True, error_model='numpy')
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-#: a part of a DLO between two clamps
+#: the part of a DLO between two clamps, which resists twist
 SPAN = np.dtype([
-    ('first', 'i8'), ('last', 'i8'),  # segments, which the clamps hold
+    ('first', 'i8'), ('last', 'i8'),  # segments that the clamps hold
     ('stiffness', 'f8'),  # torque per angle [N m]
-    ('angle', 'f8'),  # of twist [rad]
-    ('begun', 'i8'),  # 1 where it has been stepped since the clamps closed, else 0
-    ('start', 'f8', 3), ('start_frame', 'f8', 3),  # unit vectors along and across the first when it began
-    ('end', 'f8', 3), ('end_frame', 'f8', 3)], align=True)  # and of the last
+    ('angle', 'f8'),  # twist [rad]
+    ('begun', 'i8'),  # 1 if it has been stepped since the clamps closed, else 0
+    ('start', 'f8', 3), ('start_frame', 'f8', 3),  # unit vectors along and across `first` at that time
+    ('end', 'f8', 3), ('end_frame', 'f8', 3)], align=True)  # and of `last`
 
 #: two segments that touch each other
 CONTACT = np.dtype([
-    ('nodes', 'i8', 4),  # the ends of the first and of the second
-    ('weights', 'f8', 4),  # of the nodes' velocities in that of the closest points to each other
-    ('yielding', 'f8', 4),  # inverse masses of the nodes [1/kg], 0 where something supports them
-    ('normal', 'f8', 3),  # unit vector from the second to the first
-    ('mobility', 'f8'),  # velocity per impulse [1/kg]
-    ('wanted', 'f8'),  # least velocity at which they part [m/s]
-    ('pushed', 'f8'), ('rubbed', 'f8', 3),  # impulses along the normal and across it until now [N s]
-    ('impulse', 'f8', 3)], align=True)  # of the iteration under way [N s]
+    ('nodes', 'i8', 4),  # ends of the first and of the second segment
+    ('weights', 'f8', 4),  # of the nodes in the relative velocity of the closest points
+    ('yielding', 'f8', 4),  # inverse masses of the nodes [1/kg]; 0 if another body supports them
+    ('normal', 'f8', 3),  # unit vector from the second to the first segment
+    ('mobility', 'f8'),  # relative velocity per impulse [1/kg]
+    ('least', 'f8'),  # least velocity along the normal [m/s]
+    ('pushed', 'f8'), ('rubbed', 'f8', 3),  # total impulses along and across the normal [N s]
+    ('impulse', 'f8', 3)], align=True)  # of the current iteration [N s]
 
 TYPES['Spans'], TYPES['Contacts'] = numba.from_dtype(SPAN)[::1], numba.from_dtype(CONTACT)[::1]
 
 
-@_state
+@_record
 class RodState(NamedTuple):
     """
-    What the internal forces of N nodes follow from; see `rod.Rod`, which makes it.
+    All that determines the internal forces of N nodes; `rod.Rod` makes it.
 
-    :param rest_lengths: (N - 1,) [m] of the segments.
-    :param stiffness: (N - 1,) of each stretching spring [N/m].
+    :param rest_lengths: (N - 1,) [m] lengths of the segments at rest.
+    :param stiffness: (N - 1,) [N/m] of the stretching springs.
     :param masses: (N,) [kg].
     :param inverse_masses: (N,) [1/kg], 0 for held nodes.
-    :param bending: (3, N) bending matrix [N/m]: its diagonal and the two below it.
-    :param natural: (N - 2,) [N m] EI times natural curvature at each inner node; (0,): straight at rest.
-    :param spans: (s,) of `SPAN`: what resists twist.
+    :param bending: (3, N) [N/m] bending matrix: its diagonal and the two below.
+    :param natural: (N - 2,) [N m] EI times natural curvature at each inner node; (0,): a straight rest shape.
+    :param spans: (s,) of `SPAN`: the parts that resist twist.
     :param held: (h,) nodes that follow given velocities.
-    :param follow: (h, 3) [m/s] these velocities.
-    :param drag: [1/s].
-    :param implicit: c of the step [s^2].
-    :param step: [s].
-    :param bands: (3 N + 6, 7), workspace: columns of the lower triangle of the matrix.
-    :param right: (3 N + 6,), workspace: right side.
+    :param follow: (h, 3) [m/s] velocities of the held nodes.
+    :param drag: acceleration against the velocity [1/s].
+    :param implicit: c [s^2] of the step; see `rod`.
+    :param step: time step [s].
+    :param bands: (3 N + 6, 7) workspace: columns of the lower triangle of the matrix.
+    :param right: (3 N + 6,) workspace: right side.
     """
 
     rest_lengths: Vector
@@ -145,28 +139,28 @@ class RodState(NamedTuple):
     right: Vector
 
 
-@_state
+@_record
 class SelfContact(NamedTuple):
     """
     Contact of S segments with each other: capsules that do not pass through each other.
 
-    Spheres at the nodes cannot do this for a thin DLO, whose nodes lie further apart than its
-    diameter.  Parts that are nearer along the DLO than half the circumference of its
-    cross-section cannot touch: that is how far apart the legs of the tightest hairpin are.
-    Pairs that are nearer than a diameter at the start keep that distance until they have
-    moved apart, so that a radius that is larger than the real one does not burst the DLO open.
+    Spheres at the nodes would let parts of a thin DLO through, because its nodes lie further
+    apart than its diameter.  Two segments whose arc-length distance is below half the
+    circumference of the cross-section cannot touch: that is the shortest hairpin.  Pairs that
+    are nearer than a diameter at the start keep that distance until they have moved apart, so
+    that a radius that is too large does not burst the DLO open.
 
     :param half: (S,) [m] half the lengths of the segments.
-    :param middles: (S,) [m] where their middles are along the DLO.
+    :param middles: (S,) [m] arc lengths of their middles.
     :param diameter: [m].
-    :param apart: pairs that are nearer along the DLO cannot touch [m].
+    :param apart: least arc length [m] between two segments that can touch.
     :param friction: Coulomb coefficient.
-    :param distances: (S, S) [m] that pairs keep.
-    :param pairs: (S (S - 1) / 2, 2), of which the first ones are near each other now.
-    :param near: (1,) how many.
-    :param room: (1,) how far nodes may move before others are [m]; less than 0: not known.
+    :param distances: (S, S) [m] least distances of the pairs.
+    :param pairs: (S (S - 1) / 2, 2) segments; the first `near` of these pairs are near each other.
+    :param near: (1,) number of these pairs.
+    :param room: (1,) [m] how far nodes may move until pairs must be searched again; negative: search now.
     :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
-    :param change: (S + 1, 3), workspace.
+    :param change: (S + 1, 3) workspace.
     """
 
     half: Vector
@@ -182,23 +176,23 @@ class SelfContact(NamedTuple):
     change: Matrix
 
 
-@_state
+@_record
 class RopeState(NamedTuple):
     """
-    A DLO between two steps; see `rope.Rope`, which makes it.
+    The state of a DLO between two steps; `rope.Rope` makes it.
 
     :param points: (N, 3) [m].
     :param velocities: (N, 3) [m/s].
-    :param wanted: (N, 3) [m/s] velocities that it would have but for other bodies.
-    :param support: (N, 3) [m/s] change of velocity that other bodies caused in the last step.
+    :param predicted: (N, 3) [m/s] velocities after the step without contact with other bodies.
+    :param support: (N, 3) [m/s] change of the velocities by other bodies in the last step.
     :param gravity: (3,) [m/s^2].
-    :param rod: its internal forces.
-    :param contact: with itself.
+    :param rod: all about the internal forces.
+    :param contact: all about contact with itself.
     """
 
     points: Matrix
     velocities: Matrix
-    wanted: Matrix
+    predicted: Matrix
     support: Matrix
     gravity: Vector
     rod: RodState
@@ -211,8 +205,8 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 
     :param bands: (m + 6, 7) columns of the lower triangle, the last six rows unused; destroyed.
-    :param right: (m + 6,) right side, becomes the solution.
-    :returns: False where the matrix is not positive definite or anything is not finite.
+    :param right: (m + 6,) right side; becomes the solution.
+    :returns: False if the matrix is not positive definite or a value is not finite.
     """
     size = len(right) - BAND + 1
     for j in range(size):
@@ -239,14 +233,14 @@ def _solve(bands: Matrix, right: Vector) -> bool:
 
 
 @_part
-def _carry(frame: Vector, before: Vector, tangent: Vector) -> None:
-    """Turn `frame` (3,), perpendicular to `before` (3,), by the smallest rotation to another tangent (3,)."""
+def _transport(frame: Vector, before: Vector, tangent: Vector) -> None:
+    """Transport `frame` (3,) from the tangent `before` (3,) to another by the smallest rotation, in place."""
     cosine = before[0] * tangent[0] + before[1] * tangent[1] + before[2] * tangent[2]
     along = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]
     share = along / max(1.0 + cosine, 2 * HAIRPIN)
     for c in range(3):
         frame[c] -= share * (before[c] + tangent[c])
-    left = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]  # nothing but in a hairpin
+    left = frame[0] * tangent[0] + frame[1] * tangent[1] + frame[2] * tangent[2]  # zero except in a hairpin
     for c in range(3):
         frame[c] -= left * tangent[c]
     size = math.sqrt(frame[0]**2 + frame[1]**2 + frame[2]**2)
@@ -255,8 +249,8 @@ def _carry(frame: Vector, before: Vector, tangent: Vector) -> None:
 
 
 @_part
-def _along(points: Matrix, tangents: Matrix, lengths: Vector) -> None:
-    """Write the (n, 3) unit vectors along the segments and their (n,) lengths [m]."""
+def _tangents(points: Matrix, tangents: Matrix, lengths: Vector) -> None:
+    """Write the (n, 3) unit tangents of the segments and their (n,) lengths [m]."""
     for i in range(len(lengths)):
         for c in range(3):
             tangents[i, c] = points[i + 1, c] - points[i, c]
@@ -266,8 +260,8 @@ def _along(points: Matrix, tangents: Matrix, lengths: Vector) -> None:
 
 
 @_part
-def _across(tangent: Vector, frame: Vector) -> None:
-    """Write to `frame` (3,) some unit vector perpendicular to a (3,) tangent."""
+def _perpendicular(tangent: Vector, frame: Vector) -> None:
+    """Write to `frame` (3,) a unit vector perpendicular to a (3,) tangent."""
     least = 0
     for c in range(1, 3):
         if abs(tangent[c]) < abs(tangent[least]):
@@ -279,7 +273,7 @@ def _across(tangent: Vector, frame: Vector) -> None:
 
 @_part
 def _add_couples(torques: Matrix, tangents: Matrix, lengths: Vector, step: float, right: Vector) -> None:
-    """Add to `right` the impulses [N s] at the ends of segments that (n, 3) torques [N m] on them are."""
+    """Add to `right` the impulses [N s] at the segments' ends that are equal to (n, 3) torques [N m]."""
     for i in range(len(lengths)):
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3
@@ -291,36 +285,36 @@ def _add_couples(torques: Matrix, tangents: Matrix, lengths: Vector, step: float
 @_part
 def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> None:
     """
-    Add to `right` (3 N,) the impulses [N s] of a DLO that is curved where nothing bends it.
+    Add to `right` (3 N,) the impulses [N s] of a DLO with a curved rest shape.
 
     With natural curvature k the bending energy of inner node i is
-    ``EI / (2 l) |t_i - t_(i-1) - k l d_i|^2``, l the length it stands for, d_i the
-    direction of the curve that the DLO has at rest: a unit vector of a frame that goes
-    along the DLO without twist (Bishop, There is more than one way to frame a
-    curve, 1975; transported from segment to segment as in Bergou et al., Discrete
-    Elastic Rods, 2008, 4.2).  Multiplied out, the first part is that of a straight
-    DLO, the last is constant, and what remains is
+    ``EI / (2 l) |t_i - t_(i-1) - k l d_i|^2``.  There, l is the length that the node
+    stands for, and d_i the direction of the curvature at rest: a unit vector of a frame
+    without twist (Bishop, There is more than one way to frame a curve, 1975;
+    transported from segment to segment as in Bergou et al., Discrete Elastic Rods,
+    2008, 4.2).  Of the square, the first term is the energy of a straight DLO and the
+    last one is constant.  The mixed term remains:
 
         -k EI g_i,    g_i = 2 sin(angle_i / 2) cos(angle from d_i to the plane of the bend)
 
-    The frame as a whole turns freely about the DLO to where its energy is least: a
-    DLO has next to no inertia about its axis, and how hands hold it does not
-    tell how it was coiled.  With a and b the sums of ``k EI g_i`` for two perpendicular
-    d, that is ``-sqrt(a^2 + b^2)``.  At a straight DLO that has a cusp, rounded off by
-    `ROUNDED`.
+    The frame as a whole turns freely about the DLO to the least energy, because a
+    DLO has almost no inertia about its axis and the grips do not tell in which
+    direction it was coiled.  With a and b the sums of ``k EI g_i`` for two perpendicular
+    d, the least energy is ``-sqrt(a^2 + b^2)``.  It has a cusp where the DLO is
+    straight; `ROUNDED` rounds it off.
 
-    The forces are its exact slope.  A segment can turn about its axis without
-    inertia, so that the torque of its two joints about that axis vanishes, with the
-    moment that the joints need against twist; the rest of the torque is a couple of
-    forces at its ends.
+    The forces are the exact gradient of this energy.  A segment has no inertia about its
+    axis, so the torques of its two joints about the axis cancel; the twisting moments of
+    the joints follow from that.  A couple of forces at the segment's ends replaces the
+    rest of the torque.
 
     :param moments: (N - 2,) [N m] EI times natural curvature at each inner node.
     """
     n = len(points) - 1
     tangents, frames, torques = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
-    lengths, halves, bends = np.empty(n), np.empty(n), np.empty((n, 2))  # two of them at the end of each
-    _along(points, tangents, lengths)
-    _across(tangents[0], frames[0])
+    lengths, halves, bends = np.empty(n), np.empty(n), np.empty((n, 2))  # bends: in two directions
+    _tangents(points, tangents, lengths)
+    _perpendicular(tangents[0], frames[0])
     total_x, total_y, total_moment = 0.0, 0.0, 0.0
     for i in range(n - 1):
         a, b, frame = tangents[i], tangents[i + 1], frames[i]
@@ -330,7 +324,7 @@ def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> 
         y = (b[0] * (a[1] * frame[2] - a[2] * frame[1]) + b[1] * (a[2] * frame[0] - a[0] * frame[2])
              + b[2] * (a[0] * frame[1] - a[1] * frame[0]))
         frames[i + 1] = frame
-        _carry(frames[i + 1], a, b)
+        _transport(frames[i + 1], a, b)
         bends[i, 0], bends[i, 1] = x / halves[i], y / halves[i]
         total_x += moments[i] * bends[i, 0]
         total_y += moments[i] * bends[i, 1]
@@ -371,41 +365,41 @@ def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> 
 @_part
 def add_twist(points: Matrix, spans: Spans, step: float, right: Vector) -> None:
     """
-    Add to `right` (3 N,) the impulses [N s] of twist between clamps; bring `spans` up to date.
+    Add to `right` (3 N,) the impulses [N s] of twist between clamps; update `spans`.
 
-    A DLO has next to no inertia about its axis, so that twist is the same all along,
-    between two clamps, whenever its stiffness is; the energy is ``c / 2 angle^2`` (Bergou et al., Discrete
-    Elastic Rods, 2008, 4.2.2).  The angle is that from a frame carried from the first clamp to the
-    second along the DLO without twist to the frame that the second clamp holds.  It is
-    zero when both are closed.  How a clamp turns about the DLO's axis is not known, only its
-    direction: it turns by the smallest rotation from that when it closed.
+    A DLO has almost no inertia about its axis, so its twisting moment is constant between two
+    clamps.  The energy is ``c / 2 angle^2`` (Bergou et al., Discrete Elastic Rods, 2008, 4.2.2).
+    To measure the angle, a frame is transported along the DLO without twist from the first clamp
+    to the second and compared with the frame of the second clamp.  The angle is zero when both
+    have just closed.  The trial gives only the direction of a clamp, not its rotation about the
+    DLO's axis: we take the smallest rotation since it closed.
 
-    The forces are the exact slope: a torque of the same size about every joint, of
-    which the segments pass on as a couple what is across them.
+    The forces are the exact gradient: the same torque about every joint, whose part across
+    a segment becomes a couple of forces at its ends.
     """
     n = len(points) - 1
     tangents, torques, lengths = np.empty((n, 3)), np.zeros((n, 3)), np.empty(n)
-    _along(points, tangents, lengths)
+    _tangents(points, tangents, lengths)
     frame, there, before = np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(spans)):
         span = spans[k]
         a, b = span.first, span.last
         if span.begun == 0:
-            _across(tangents[a], frame)
+            _perpendicular(tangents[a], frame)
             for c in range(3):
                 span.start[c], span.start_frame[c] = tangents[a, c], frame[c]
         for c in range(3):
             before[c], frame[c] = span.start[c], span.start_frame[c]
-        _carry(frame, before, tangents[a])
+        _transport(frame, before, tangents[a])
         for i in range(a, b):
-            _carry(frame, tangents[i], tangents[i + 1])
+            _transport(frame, tangents[i], tangents[i + 1])
         if span.begun == 0:
             span.begun = 1
             for c in range(3):
                 span.end[c], span.end_frame[c] = tangents[b, c], frame[c]
         for c in range(3):
             before[c], there[c] = span.end[c], span.end_frame[c]
-        _carry(there, before, tangents[b])
+        _transport(there, before, tangents[b])
         x, y = 0.0, 0.0
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3
@@ -427,11 +421,11 @@ def add_twist(points: Matrix, spans: Spans, step: float, right: Vector) -> None:
 
 
 @_part
-def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, wanted: Matrix) -> bool:
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> bool:
     """
-    Put the velocities (N, 3) [m/s] after one step of the internal forces into `wanted`; see `rod`.
+    Write to `predicted` the (N, 3) velocities [m/s] after a step of the internal forces; see `rod`.
 
-    :returns: False where the rollout diverges.
+    :returns: False if the rollout diverges.
     """
     rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
     held, follow, bands, right = rod.held, rod.follow, rod.bands, rod.right
@@ -509,20 +503,20 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, wanted: Ma
         return False
     for i in range(n):
         for c in range(3):
-            wanted[i, c] = right[3 * i + c]
+            predicted[i, c] = right[3 * i + c]
     for h in range(len(held)):
         for c in range(3):
-            wanted[held[h], c] = follow[h, c]
+            predicted[held[h], c] = follow[h, c]
     return True
 
 
 @_part
 def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
     """
-    Return where two segments are nearest: Ericson, Real-Time Collision Detection, 5.1.9.
+    Return the closest points of two segments (Ericson, Real-Time Collision Detection, 5.1.9).
 
-    :returns: s and t, 0..1, the places on the first and on the second segment; the unit normal
-        from the second to the first; the distance [m].
+    :returns: s and t, 0..1, their places on the first and on the second segment; the unit normal from
+        the second to the first, three numbers; the distance [m].
     """
     p0, p1, p2 = points[first, 0], points[first, 1], points[first, 2]
     q0, q1, q2 = points[second, 0], points[second, 1], points[second, 2]
@@ -554,10 +548,10 @@ def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
 @_part
 def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
     """
-    List in `contact.pairs` the pairs of segments that may touch each other and are nearer than `reach` [m].
+    Write to `contact.pairs` the pairs of segments that can touch and whose gap may be below `reach` [m].
 
-    :param stretch: how much longer than at rest a segment may be.
-    :returns: how many there are.
+    :param stretch: largest length of a segment, relative to its rest length.
+    :returns: the number of pairs.
     """
     half, middles, pairs, diameter = contact.half, contact.middles, contact.pairs, contact.diameter
     apart, count, segments = contact.apart, 0, len(half)
@@ -582,7 +576,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
 
 @_compiled
 def start_distances(contact: SelfContact, points: Matrix) -> None:
-    """Take the (N, 3) [m] points at the start, where nothing may be kicked apart."""
+    """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
     distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
     distances[:] = diameter
     for k in range(near_pairs(contact, points, 1.0, 0.0)):
@@ -592,10 +586,10 @@ def start_distances(contact: SelfContact, points: Matrix) -> None:
 
 
 @_part
-def _touching(touching: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
-    """Fill in which of the first `near` pairs would come too near within a step; return how many."""
-    distances, diameter = touching.distances, touching.diameter
-    pairs, contacts = touching.pairs, touching.contacts
+def _find_contacts(capsules: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
+    """Write those of the first `near` pairs that would come too near within a step; return their number."""
+    distances, diameter = capsules.distances, capsules.diameter
+    pairs, contacts = capsules.pairs, capsules.contacts
     count = 0
     for k in range(near):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -603,7 +597,7 @@ def _touching(touching: SelfContact, near: int, points: Matrix, velocities: Matr
         allowed = max(distances[i, j], min(distance, diameter))
         distances[i, j] = allowed
         gap = distance - allowed
-        wanted = -gap / step if gap > 0 else min(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT)
+        least = -gap / step if gap > 0 else min(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT)
         approach = 0.0
         contact = contacts[count]
         contact.normal[0], contact.normal[1], contact.normal[2] = n0, n1, n2
@@ -614,8 +608,8 @@ def _touching(touching: SelfContact, near: int, points: Matrix, velocities: Matr
             at = contact.nodes[m]
             approach += contact.weights[m] * (
                 velocities[at, 0] * n0 + velocities[at, 1] * n1 + velocities[at, 2] * n2)
-        if approach < wanted:
-            contact.wanted = wanted
+        if approach < least:
+            contact.least = least
             count += 1
     return count
 
@@ -623,15 +617,15 @@ def _touching(touching: SelfContact, near: int, points: Matrix, velocities: Matr
 @_part
 def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Matrix, change: Matrix) -> None:
     """
-    Fill in which nodes of the first `count` contacts yield, and how much.
+    Find out which nodes of the first `count` contacts yield, and how much.
 
-    A node does not yield to a push against what supports it (a strand on a table carries another
-    one), but passes the push on to that body.
+    A node does not yield to a push towards a body that supports it, but passes the push on to that
+    body: so a strand on a table carries another one.
     """
     change[:] = 0.0
     for k in range(count):
         for m in range(4):
-            change[contacts[k].nodes[m], 0] += 1.0  # how many contacts share the node
+            change[contacts[k].nodes[m], 0] += 1.0  # number of contacts that share the node
     for k in range(count):
         contact = contacts[k]
         given, full, shared = 0.0, 0.0, 0.0
@@ -654,7 +648,7 @@ def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Ma
             if given < WEDGED * full:
                 contact.yielding[m] = inverse_masses[at]
             shared += contact.weights[m]**2 * contact.yielding[m] * change[at, 0]
-        contact.mobility = shared if shared > 0 else math.inf  # both held
+        contact.mobility = shared if shared > 0 else math.inf  # all nodes are held
         contact.pushed = 0.0
         for c in range(3):
             contact.rubbed[c] = 0.0
@@ -662,7 +656,7 @@ def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Ma
 
 @_part
 def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Matrix, change: Matrix) -> None:
-    """Make one iteration over the first `count` contacts, with Coulomb friction."""
+    """Make one iteration of the solver over the first `count` contacts, with Coulomb friction."""
     change[:] = 0.0
     for k in range(count):
         contact = contacts[k]
@@ -673,7 +667,7 @@ def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Mat
                 relative += contact.weights[m] * velocities[contact.nodes[m], c]
             contact.impulse[c] = relative
             approach += relative * contact.normal[c]
-        push = max(contact.pushed + (contact.wanted - approach) / contact.mobility, 0.0)
+        push = max(contact.pushed + (contact.least - approach) / contact.mobility, 0.0)
         for c in range(3):
             contact.impulse[c] = contact.rubbed[c] - (
                 contact.impulse[c] - approach * contact.normal[c]) / contact.mobility
@@ -693,7 +687,7 @@ def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Mat
 
 @_part
 def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities: Matrix) -> None:
-    """Let the nodes that did not yield pass the impulses on to what supports them."""
+    """Let the nodes that did not yield pass the impulses on to the bodies that support them."""
     for k in range(count):
         contact = contacts[k]
         for m in range(4):
@@ -705,7 +699,7 @@ def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities:
 
 @_part
 def _travel(velocities: Matrix, step: float) -> float:
-    """Return how far the two fastest nodes may come nearer to each other in a step [m]."""
+    """Return an upper bound [m] of how far two nodes approach each other in a step."""
     fastest = 0.0
     for i in range(len(velocities)):
         fastest = max(fastest, velocities[i, 0]**2 + velocities[i, 1]**2 + velocities[i, 2]**2)
@@ -714,7 +708,7 @@ def _travel(velocities: Matrix, step: float) -> float:
 
 @_part
 def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> bool:
-    """Tell whether any pair is near; `room` and `near` are those of `SelfContact`."""
+    """Tell whether any pair may be near; `room` and `near` are those of `SelfContact`."""
     room[0] -= _travel(velocities, step)
     return bool(room[0] < 0 or near[0] > 0)
 
@@ -723,22 +717,22 @@ def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> b
 def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector,
                support: Matrix, step: float) -> None:
     """
-    Make `velocities` what the contacts between pairs of segments allow, where they `may_touch`.
+    Correct `velocities` so that segments do not pass through each other; call it if they `may_touch`.
 
-    They are velocity constraints, solved by Jacobi iterations with mass splitting (Tonge et al., Mass
+    Contacts are velocity constraints, solved by Jacobi iterations with mass splitting (Tonge et al., Mass
     Splitting for Jitter-Free Parallel Rigid Body Simulation, 2012).
 
-    :param points: (N, 3) [m] now.
-    :param velocities: (N, 3) [m/s] that the DLO would have without contacts.
+    :param points: (N, 3) [m] at the start of the step.
+    :param velocities: (N, 3) [m/s] that the DLO would have without contact.
     :param inverse_masses: (N,) [1/kg], 0 for held nodes.
-    :param support: (N, 3) [m/s] change of velocity that other bodies last caused.
-    :param step: [s].
+    :param support: (N, 3) [m/s] change of the velocities by other bodies in the last step.
+    :param step: time step [s].
     """
     near = contact.near
-    if contact.room[0] < 0:
-        near[0] = near_pairs(contact, points, STRETCH, _travel(velocities, step) + SKIN)
+    if contact.room[0] < 0:  # a segment may be stretched by 20 %
+        near[0] = near_pairs(contact, points, 1.2, _travel(velocities, step) + SKIN)
         contact.room[0] = SKIN
-    count = _touching(contact, near[0], points, velocities, step)
+    count = _find_contacts(contact, near[0], points, velocities, step)
     if count == 0:
         return
     contacts, change = contact.contacts, contact.change
@@ -751,20 +745,24 @@ def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse
 @_part
 def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: float, step: float) -> None:
     """
-    Make `velocities` what a table allows, with Coulomb friction, as Bullet does.
+    Correct `velocities` for contact with a table, with Coulomb friction.
+
+    The constants are Bullet's (PyBullet 3.2.7), found by single steps of a sphere on a plane.
 
     :param level: height of nodes that touch the table [m].
     """
+    slop = 1e-5  # m of penetration that is allowed
+    margin = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
     for i in range(len(points)):
         distance = points[i, 2] - level
-        if distance > MARGIN:
+        if distance > margin:
             continue
-        depth = -(distance + SLOP)
-        wanted = PUSHED_OUT * depth / step if depth > 0 else depth / step
-        push = wanted - velocities[i, 2]
+        depth = -(distance + slop)
+        least = 0.08 * depth / step if depth > 0 else depth / step  # one step corrects 8 %
+        push = least - velocities[i, 2]
         if push <= 0:
             continue
-        velocities[i, 2] = wanted
+        velocities[i, 2] = least
         speed = math.hypot(velocities[i, 0], velocities[i, 1])
         share = 1.0 - min(1.0, friction * push / speed) if speed > 0 else 0.0
         velocities[i, 0] *= share
@@ -774,7 +772,7 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
 @_part
 def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Matrix, held: Indices,
                 follow: Matrix, step: float) -> None:
-    """Add gravity to the velocities, and find those of the held nodes."""
+    """Add gravity to the velocities; write those of the held nodes to `follow`."""
     for h in range(len(held)):
         for c in range(3):
             follow[h, c] = (targets[h, c] - points[held[h], c]) / step
@@ -784,20 +782,20 @@ def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Ma
 
 
 @_compiled
-def want(rope: RopeState, targets: Matrix) -> bool:
+def predict_velocities(rope: RopeState, targets: Matrix) -> bool:
     """
-    Put into `rope.wanted` the velocities that gravity, the internal forces and self-contact give.
+    Write to `rope.predicted` the velocities due to gravity, internal forces and self-contact.
 
-    :param targets: (h, 3) [m] where the held nodes are after the step.
-    :returns: False where the rollout diverges.
+    :param targets: (h, 3) [m] positions of the held nodes after the step.
+    :returns: False if the rollout diverges.
     """
     rod, contact = rope.rod, rope.contact
-    points, velocities, wanted = rope.points, rope.velocities, rope.wanted
+    points, velocities, predicted = rope.points, rope.velocities, rope.predicted
     _start_step(points, velocities, rope.gravity, targets, rod.held, rod.follow, rod.step)
-    if not rod_velocities(rod, points, velocities, wanted):
+    if not rod_velocities(rod, points, velocities, predicted):
         return False
-    if may_touch(wanted, rod.step, contact.room, contact.near):
-        keep_apart(contact, points, wanted, rod.inverse_masses, rope.support, rod.step)
+    if may_touch(predicted, rod.step, contact.room, contact.near):
+        keep_apart(contact, points, predicted, rod.inverse_masses, rope.support, rod.step)
     return True
 
 
@@ -806,31 +804,31 @@ def advance(rope: RopeState, targets: Cube, level: float, path: Cube) -> int:
     """
     Take k steps on a table.
 
-    :param targets: (k, h, 3) [m] where the held nodes are after each step.
+    :param targets: (k, h, 3) [m] positions of the held nodes after each step.
     :param level: height of nodes that touch the table [m].
-    :param path: (k, N, 3) to write where all nodes are after each step [m]; or empty.
-    :returns: how many steps were taken; fewer than k where the rollout diverged.
+    :param path: (k, N, 3) [m] where the positions of all nodes after each step are written; or empty.
+    :returns: number of steps taken, below k if the rollout diverged.
     """
     rod, contact, gravity, inverse_masses = rope.rod, rope.contact, rope.gravity, rope.rod.inverse_masses
-    points, velocities, wanted, support = rope.points, rope.velocities, rope.wanted, rope.support
+    points, velocities, predicted, support = rope.points, rope.velocities, rope.predicted, rope.support
     held, follow, step, friction = rod.held, rod.follow, rod.step, contact.friction
     room, near = contact.room, contact.near
     for k in range(len(targets)):
         _start_step(points, velocities, gravity, targets[k], held, follow, step)
-        if not rod_velocities(rod, points, velocities, wanted):
+        if not rod_velocities(rod, points, velocities, predicted):
             return k
-        if may_touch(wanted, step, room, near):
-            keep_apart(contact, points, wanted, inverse_masses, support, step)
+        if may_touch(predicted, step, room, near):
+            keep_apart(contact, points, predicted, inverse_masses, support, step)
         for i in range(len(points)):
             for c in range(3):
-                velocities[i, c] = wanted[i, c]
+                velocities[i, c] = predicted[i, c]
         rest_on_table(points, velocities, level, friction, step)
         for h in range(len(held)):
             for c in range(3):
                 velocities[held[h], c] = follow[h, c]
         for i in range(len(points)):
             for c in range(3):
-                support[i, c] = velocities[i, c] - wanted[i, c]
+                support[i, c] = velocities[i, c] - predicted[i, c]
                 points[i, c] += step * velocities[i, c]
         for h in range(len(held)):
             for c in range(3):

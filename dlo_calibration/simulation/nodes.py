@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""NodeLayout: where the nodes of the simulated DLO lie, and how observed points follow from them."""
+"""NodeLayout: where the nodes of the simulated DLO lie, and how they give the observed points."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class NodeLayout:
     """
     Nodes of the simulated DLO.
 
-    :param places: (N,) [m] along the DLO at rest, from 0, increasing; every
+    :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing; every
         gripped point has a node of its own.
-    :param points: (N, 3) [m] at the start.
+    :param points: (N, 3) [m] positions of the nodes at the start.
     :param velocities: (N, 3) [m/s] at the start.
-    :param observe: (n, N) weights; with the nodes' positions they give the observed points.
-    :param point_places: (n,) [m] of the observed points along the DLO.
-    :param features: (N,) share of each node in the points annotated as feature.
+    :param observe: (n, N) weights; multiplied by the nodes' positions they give the observed points.
+    :param point_places: (n,) [m] arc lengths of the observed points.
+    :param features: (N,) number of points annotated as feature at each node, see `feature_shares`.
     """
 
     places: Floats
@@ -47,11 +47,11 @@ class NodeLayout:
         """
         Lay out `count` nodes, as equally spaced as the gripped points allow.
 
-        There is none within a clamp that holds from the start: that piece does not bend.
-        The initial chain is smoothed as the noise of the trial's chains asks
-        for: noise makes a chain longer, and bends a stiff one as nothing real does.
+        No node lies inside a clamp that holds from the start, because that piece does not bend.
+        The initial chain is smoothed according to the noise level of the trial's chains: noise
+        makes a chain longer, and bends a stiff DLO more than is possible.
 
-        :raises InputError: where more points are gripped than there can be nodes.
+        :raises InputError: if more points are gripped than there are nodes.
         """
         initial = _without_noise(trial)
         point_places = initial.arc_lengths()
@@ -75,11 +75,11 @@ class NodeLayout:
 
 def feature_shares(chain: Chain, places: Floats) -> Floats:
     """
-    Return how many of the points annotated as feature belong to each node, (N,).
+    Return the number of points annotated as feature at each node, (N,), with fractions.
 
-    What is between two nodes goes to both, so that its centre of mass stays in place.
+    A point between two nodes is shared by both, so that its centre of mass stays in place.
 
-    :param places: (N,) [m] of the nodes along the chain.
+    :param places: (N,) [m] arc lengths of the nodes.
     """
     at = chain.arc_lengths()[chain.features]
     after = np.clip(np.searchsorted(places, at), 1, len(places) - 1)
@@ -91,7 +91,7 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
 
 
 def _without_noise(trial: Trial) -> Chain:
-    """Return the initial chain, smoothed."""
+    """Return the initial chain, smoothed according to the noise level of the trial."""
     sigma = noise([trial])
     if not sigma > NO_NOISE:
         return trial.initial
@@ -100,9 +100,9 @@ def _without_noise(trial: Trial) -> Chain:
 
 def spread_places(fixed: Floats, count: int, rigid: NDArray[np.bool_] | None = None) -> Floats:
     """
-    Return `count` increasing places that contain the `fixed` ones, the others evenly between.
+    Return `count` increasing arc lengths [m]: the (f,) `fixed` ones, and others evenly between them.
 
-    :param rigid: (f - 1,) pieces between the f fixed places that stay whole, unless all are; None: none.
+    :param rigid: (f - 1,) pieces between fixed places that get no places inside, unless all are rigid.
     """
     pieces = np.ones(len(fixed) - 1, int)
     widths = np.diff(fixed)

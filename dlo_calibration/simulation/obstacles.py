@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Scene: fixed obstacles that the DLO touches, as a URDF file describes them.
+Scene: fixed obstacles that the DLO touches, described by a URDF file.
 
-Of a URDF only what stands where is read: links, the origins of joints (movable ones
-stand at 0), collision shapes and their friction.  An engine's own importer would make
-one articulated body, whose links move when they are touched.
+Only links, the origins of joints (movable joints are at position 0), collision shapes
+and their friction are read.  The importer of an engine would make one articulated body,
+whose links move when they are touched.
 """
 
 from __future__ import annotations
@@ -23,9 +23,6 @@ from scipy.spatial.transform import Rotation
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
 
-EXPECTED = 'a URDF file with collision shapes'
-FRICTION = 1.0  # of a link that gives none, like the table's
-
 #: shape -> its attributes that are sizes [m]
 SIZES: Mapping[str, tuple[str, ...]] = {
     'box': ('size',), 'sphere': ('radius',), 'cylinder': ('length', 'radius'),
@@ -35,15 +32,15 @@ SIZES: Mapping[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 class Obstacle:
     """
-    A collision shape that stays where it is.
+    A collision shape that does not move.
 
     :param shape: one of `SIZES`.
     :param sizes: (3,) [m] edges of a box; (1,) radius of a sphere; (2,) length and
         radius of a cylinder or capsule along z; (3,) scale of a mesh.
-    :param position: (3,) [m] of its middle.
-    :param turn: (4,) quaternion x y z w.
-    :param friction: Coulomb coefficient.
-    :param file: of a mesh; else empty.
+    :param position: (3,) [m] of its centre.
+    :param turn: (4,) orientation, quaternion x y z w.
+    :param friction: Coulomb coefficient; 1, as of the table, if the link has none.
+    :param file: path of a mesh; else empty.
     """
 
     shape: str
@@ -62,7 +59,7 @@ def read_scene(path: str) -> tuple[Obstacle, ...]:
     """
     Return every collision shape of a URDF file, in the order of the file.
 
-    :raises InputError: where the file cannot be used; the text names the element.
+    :raises InputError: if the file cannot be used; the text names the element.
     """
     try:
         octets = Path(path).read_bytes()
@@ -81,8 +78,8 @@ def read_scene(path: str) -> tuple[Obstacle, ...]:
 
 
 def unusable(path: str, came: str, remedy: str = 'correct the file') -> InputError:
-    """Return the error about a scene."""
-    return InputError(f'scene {path}', came, EXPECTED, remedy)
+    """Return the error for a scene that cannot be used."""
+    return InputError(f'scene {path}', came, 'a URDF file with collision shapes', remedy)
 
 
 class _Reader:
@@ -94,11 +91,11 @@ class _Reader:
             ends = [end.get('link', '') for tag in ('parent', 'child') for end in joint.findall(tag)]
             if len(ends) != 2 or ends[1] in self._joints or not set(ends) <= set(self._links):
                 raise unusable(path, f'the joint {joint.get("name")!r} from and to {ends}',
-                               'let each joint join a parent link to a child link of its own')
+                               'give each joint a parent link and a child link of its own')
             self._joints[ends[1]] = ends[0], joint
 
     def obstacles(self) -> Iterator[Obstacle]:
-        """Go through the links."""
+        """Yield the obstacles of all links."""
         for name, link in self._links.items():
             frame = self._frame(name)
             friction = self._friction(link)
@@ -112,17 +109,17 @@ class _Reader:
                                    self._mesh(geometry) if geometry.tag == 'mesh' else '')
 
     def _frame(self, name: str) -> tuple[Floats, Rotation]:
-        """Return where a link is: position (3,) [m] and rotation."""
+        """Return the position (3,) [m] and the rotation of a link."""
         frame = np.zeros(3), Rotation.identity()
         for _ in self._links:
             if name not in self._joints:
                 return frame
             name, joint = self._joints[name]
             frame = _after(self._origin(joint), frame)
-        raise unusable(self._path, f'joints that go round in a circle at link {name!r}')
+        raise unusable(self._path, f'joints that form a loop at link {name!r}')
 
     def _origin(self, element: ElementTree.Element) -> tuple[Floats, Rotation]:
-        """Return what an element's <origin> says: position (3,) [m] and rotation."""
+        """Return the position (3,) [m] and the rotation in the <origin> of an element."""
         origin = element.find('origin')
         if origin is None:
             return np.zeros(3), Rotation.identity()
@@ -156,7 +153,7 @@ class _Reader:
 
     def _friction(self, link: ElementTree.Element) -> float:
         element = link.find('contact/lateral_friction')
-        friction = FRICTION if element is None else float(self._numbers(element, 'value', 1)[0])
+        friction = 1.0 if element is None else float(self._numbers(element, 'value', 1)[0])
         if friction < 0:
             raise unusable(self._path, f'lateral_friction {friction:g} of link {link.get("name")!r}',
                            'make it 0 or more')
@@ -175,5 +172,5 @@ class _Reader:
 
 
 def _after(first: tuple[Floats, Rotation], second: tuple[Floats, Rotation]) -> tuple[Floats, Rotation]:
-    """Return the frame `second`, which is given in the frame `first`."""
+    """Return the frame `second`, given relative to the frame `first`, in the frame of `first`'s parent."""
     return first[0] + first[1].apply(second[0]), first[1] * second[1]

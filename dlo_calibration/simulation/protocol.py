@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulator: what an engine does, and what a simulated trial is."""
+"""Simulator: the interface of an engine; Rollout: a simulated trial."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Trial
 
+# Defaults of both engines and of the options; doc/physics.md shows how little a finer model changes.
 DEFAULT_NODES = 41
 DEFAULT_TIME_STEP = 0.003  # s
 
@@ -23,12 +24,12 @@ class Rollout:
     """
     One simulated trial.
 
-    :param chains: (g, n, 3) [m] the simulated points at each of the g goals.
-    :param settled: (g,) False where a goal is a stable configuration and the
-        DLO had not come to rest within the time limit; it is compared as it was.
+    :param chains: (g, n, 3) [m] simulated points at each of the g goals.
+    :param settled: (g,) False if a goal is a stable configuration and the DLO did not come
+        to rest within the time limit; its configuration at that time is compared.
     :param duration: simulated time [s].
-    :param steps: time steps taken.
-    :raises SimulationError: where a point is not finite.
+    :param steps: number of time steps.
+    :raises SimulationError: if a point is not finite.
     """
 
     chains: Floats
@@ -47,30 +48,29 @@ class Simulator(Protocol):
     """
     Simulates trials; the same call gives the same rollout, bit for bit.
 
-    It is pickled to worker processes, and copied for worker threads, so what
-    belongs to one process or thread is made at the first `simulate` and dropped
-    by `__getstate__`.
+    Worker processes get a pickled simulator and worker threads a copy.  So the first
+    `simulate` creates what belongs to one process or thread, and `__getstate__` drops it.
     """
 
     name: str
 
     def prepare(self) -> None:
         """
-        Do once what all copies would else do each for itself, e.g. compile into a cache.
+        Do once what each copy would do again otherwise, e.g. compile into a cache.
 
-        Called before the first copy is made.
+        It is called before the first copy is made.
         """
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """
         Simulate a trial with physical parameters by name (SI units).
 
-        :raises SimulationError: where the rollout diverges or the trial cannot
+        :raises SimulationError: if the rollout diverges or the trial cannot
             be represented.
         """
 
     def refined(self) -> Simulator | None:
-        """Return one with twice the nodes and half the time step; None where it has no such thing."""
+        """Return a simulator with twice the segments and half the time step; None if there is none."""
 
     def close(self) -> None:
-        """Free what the simulator holds; it may be used again afterwards."""
+        """Free the resources of the simulator; it may be used again afterwards."""

@@ -4,25 +4,24 @@
 """
 Rod: the internal forces of the mass-spring chain, integrated implicitly.
 
-Point masses in a line.  Stretching springs of stiffness ``EA / l`` join
-neighbours, bending has the energy ``EI / (2 l) |t_i - t_(i-1)|^2`` at each inner
-node, with t the segment vectors divided by their rest length (the discrete
-curvature of Bergou et al., Discrete Elastic Rods, 2008, without twist).  A step is
+Springs of stiffness ``EA / l`` join neighbouring point masses.  Each inner node has the
+bending energy ``EI / (2 l) |t_i - t_(i-1)|^2``, with t the segment vectors divided by
+their rest lengths (the discrete curvature of Bergou et al., Discrete Elastic Rods,
+2008, without twist).  A step is
 
     [M (1 + drag dt) + c K] v' = M v + dt f(x),    x' = x + dt v'
 
-With c = dt^2 that is the linearised backward Euler of Baraff and Witkin, Large
-Steps in Cloth Simulation, 1998, equation 6.  For one mode of a linear spring any
-c >= dt^2 / 2 is stable at any stiffness, and its determinant shows that c damps
-it like a stiffness-proportional damping of c / dt.  So c is dt times the internal
-damping wherever that is large enough to be stable, and 0.6 dt^2 where it is
-not (at 0.5 the stiffest modes would ring for ever): the damping is then less the
-time step's.  The part of the stretching matrix that a compressed spring makes
-negative is left out, so that the matrix stays positive definite.
+With c = dt^2 this is the linearised backward Euler method of Baraff and Witkin, Large
+Steps in Cloth Simulation, 1998, equation 6.  For one mode of a linear spring, every
+c >= dt^2 / 2 is stable at any stiffness, and the determinant shows that c damps the mode
+like a stiffness-proportional damping of c / dt.  So c is dt times the internal damping,
+but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes would ring for ever);
+at this limit the damping depends on the time step.  The negative part of the matrix of
+a compressed spring is left out, so that the matrix stays positive definite.
 
-The step itself, with what natural curvature and twist add, is in `kernels`; here is what it
-works on.  Parts of different stiffness: an inner node has that of the pieces on its two
-sides in series.
+`kernels` take the step and add natural curvature and twist; this module computes their
+input.  If parts of the DLO differ in stiffness, an inner node has the stiffness of the
+pieces on its two sides in series.
 """
 
 from __future__ import annotations
@@ -37,8 +36,6 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import PART_NAMES
 from dlo_calibration.simulation.kernels import BAND, RodState, SPAN, Spans
 
-IMPLICIT = 0.6  # see the module
-
 
 @dataclass(frozen=True)
 class RodProperties:
@@ -47,14 +44,14 @@ class RodProperties:
 
     :param bending_stiffness: EI [N m^2].
     :param stretching_stiffness: EA [N].
-    :param mass: of the whole rod [kg].
-    :param drag: acceleration against the velocity [1/s].
-    :param internal_damping: damping per stiffness [s].
+    :param mass: mass of the whole rod [kg].
+    :param drag: acceleration against the velocity, relative to it [1/s].
+    :param internal_damping: damping relative to stiffness [s].
     :param length_scale: rest lengths relative to the observed ones.
-    :param natural_curvature: at rest [1/m].
-    :param marker_mass: at each point annotated as feature [kg].
+    :param natural_curvature: curvature of the rest shape [1/m].
+    :param marker_mass: mass at each point annotated as feature [kg].
     :param torsion: twisting stiffness relative to the bending stiffness.
-    :param profile: bending stiffness of equal parts of the length, relative to the first one's.
+    :param profile: bending stiffness of parts of equal length, relative to that of the first part.
     """
 
     bending_stiffness: float
@@ -71,9 +68,9 @@ class RodProperties:
     @classmethod
     def of(cls, physical: Mapping[str, float]) -> RodProperties:
         """
-        Take them from physical values by parameter name.
+        Return the properties for physical values by parameter name, in SI units.
 
-        Those that are not in it and can be absent are: an older result names fewer.
+        Optional ones may be absent, as in results of older versions.
         """
         profile = (1.0, *(physical[name] for name in PART_NAMES if name in physical))
         return cls(bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
@@ -92,7 +89,7 @@ class Rod:
     :param rest_lengths: (N - 1,) [m] of the segments as observed; they need not be equal.
     :param properties: see `RodProperties`.
     :param time_step: [s].
-    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
+    :param features: (N,) number of points annotated as feature at each node; None: there are none.
     """
 
     def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
@@ -111,17 +108,17 @@ class Rod:
             masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), natural=np.zeros(0),
             spans=np.zeros(0, SPAN), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
             drag=float(properties.drag),
-            implicit=float(time_step * max(properties.internal_damping, IMPLICIT * time_step)),
+            implicit=float(time_step * max(properties.internal_damping, 0.6 * time_step)),
             step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
             right=np.empty(3 * n + BAND - 1))
         self.hold(())
 
     def hold(self, nodes: Sequence[int]) -> None:
         """
-        Let these nodes follow given velocities from now on, and no others.
+        Let exactly these nodes follow given velocities from now on.
 
-        A segment between two held nodes is rigid, so that the bending begins
-        at its end: exactly there a clamped DLO leaves its clamp.
+        A segment between two held nodes is rigid, so bending begins at its end, where a
+        clamped DLO leaves its clamp.
         """
         state, properties = self.state, self._properties
         held = np.array(nodes, np.int64)
@@ -169,9 +166,9 @@ def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans)
     """
     Return the parts of a DLO between two clamps, (s,) of `SPAN`.
 
-    :param rigid: (N - 1,) segments that are held.
-    :param compliances: (N - 2,) [1/(N m)] of each inner node against twist.
-    :param before: those until now; what is still between the same clamps stays twisted.
+    :param rigid: (N - 1,) True for segments that are held.
+    :param compliances: (N - 2,) [1/(N m)] twisting compliance of each inner node.
+    :param before: the previous parts; a part between the same clamps keeps its twist.
     """
     held = np.flatnonzero(rigid).tolist()
     pairs = [(a, b) for a, b in zip(held[:-1], held[1:], strict=True) if b > a + 1]
@@ -186,12 +183,12 @@ def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans)
 
 
 def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: Floats) -> Floats:
-    """Bending matrix (N, N), symmetric: its diagonal and the two below it, (3, N)."""
+    """Return the diagonal and the two below it, (3, N) [N/m], of the symmetric (N, N) bending matrix."""
     n = len(rest_lengths) + 1
     before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]
     row = np.stack([before, -(before + after), after])  # curvature of node i from i - 1, i, i + 1
     bendable = np.where(rigid, 0.0, rest_lengths)
-    cells = (bendable[:-1] + bendable[1:]) / 2  # of the DLO, bent at each inner node
+    cells = (bendable[:-1] + bendable[1:]) / 2  # [m] length that bends at each inner node
     row *= np.sqrt(np.divide(stiffness, cells, out=np.zeros_like(cells), where=cells > 0))
     bands = np.zeros((3, n))
     for a in range(3):

@@ -4,9 +4,9 @@
 """
 roll_out(): the course of a simulated trial, the same for every engine.
 
-Hands close, move and open; timed goals are compared at their instant; where a
-goal is a stable configuration, time goes on until the DLO has come to rest.
-Times in which nothing happens any more are skipped.
+Hands close, move and open.  Timed goals are compared at their time; for a goal that
+is a stable configuration, the simulation continues until the DLO has come to rest.
+Time in which the DLO stays at rest is skipped.
 """
 
 from __future__ import annotations
@@ -26,19 +26,18 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Rollout
 
-CHECKS = 5  # of the displacement within one stable_time
-ROUNDING = 1e-9  # s
-LONGEST_TRACE = 5000  # steps that are kept at a time
+CHECKS = 5  # of the displacement within one `Settling.time`
+ROUNDING = 1e-9  # s; instants that differ by less are the same
 
 
 @dataclass(frozen=True)
 class Settling:
     """
-    When a DLO counts as stable.
+    When a DLO counts as stable: no point moves further than a distance within a time.
 
-    :param distance: all points moved less than that [m]
-    :param time: within that time [s], hands at rest;
-    :param limit: after that long [s] it is given up.
+    :param distance: this distance [m].
+    :param time: this time [s], while all hands are at rest.
+    :param limit: longest time [s] to wait for it.
     """
 
     distance: float = 0.0005
@@ -47,31 +46,31 @@ class Settling:
 
 
 class Stepper(Protocol):
-    """An engine's simulated DLO, placed at the start of a trial."""
+    """A simulated DLO of an engine, at the start of a trial."""
 
     time_step: float
 
     @property
     def points(self) -> Floats:
-        """The (N, 3) [m] nodes now."""
+        """The current (N, 3) [m] positions of the nodes."""
 
     def hold(self, nodes: tuple[int, ...]) -> None:
-        """Let exactly these nodes follow a path from now on."""
+        """Let exactly these nodes follow given positions from now on."""
 
-    def advance(self, targets: Floats, path: Floats = ...) -> None:
+    def advance(self, targets: Floats, path: Floats | None = None) -> None:
         """
         Take k steps.
 
-        :param targets: (k, h, 3) [m] where the held nodes are after each step.
-        :param path: (k, N, 3) to write all nodes to after each step [m]; if given.
+        :param targets: (k, h, 3) [m] positions of the held nodes after each step.
+        :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
         """
 
 
 def roll_out(trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settling) -> Rollout:
     """
-    Simulate a trial on a stepper that is at its start.
+    Simulate a trial with a stepper that is at the start of it.
 
-    :raises SimulationError: where the rollout diverges.
+    :raises SimulationError: if the rollout diverges.
     """
     return _Course(trial, layout, stepper, settling).rollout()
 
@@ -80,8 +79,8 @@ def roll_out(trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settl
 class _Grip:
     hand: Hand
     nodes: tuple[int, ...]
-    closed: int  # step at which it closed
-    path: Floats  # (k, n, 3) [m] of the nodes after each step since, until the hand rests
+    closed: int  # number of steps when it closed
+    path: Floats  # (k, n, 3) [m] positions of the nodes after each later step, until the hand rests
 
 
 class _Course:
@@ -90,17 +89,17 @@ class _Course:
         self._layout = layout
         self._stepper = stepper
         self._settling = settling
-        self._time = 0.0  # of the trial
+        self._time = 0.0  # [s] of the trial
         self._steps = 0
-        self._rests = False  # nothing has happened since the DLO came to rest
-        self._last = stepper.points, 0.0  # the points one step ago, and when that was
-        self._ahead = trial.goals  # the goal under way and those after it
+        self._rests = False  # the DLO came to rest and no hand has acted since
+        self._last = stepper.points, 0.0  # points [m] and time [s] of the step before
+        self._ahead = trial.goals  # the current goal and all later ones
         self._grips: dict[str, _Grip] = {}
         self._waiting = sorted(trial.hands, key=lambda hand: hand.start)
         self._hold()
 
     def rollout(self) -> Rollout:
-        """Go from goal to goal."""
+        """Simulate up to each goal in turn."""
         chains, settled = [], []
         traced: dict[int, Floats] = {}
         for k, goal in enumerate(self._trial.goals):
@@ -110,7 +109,7 @@ class _Course:
                 self._open(goal)
                 now = self._time
                 settled.append(self._settle(self._settling.limit))
-                self._time = now  # waiting takes no time of the trial
+                self._time = now  # settling takes no time of the trial
                 chains.append(self._observed(self._stepper.points))
             else:
                 if k not in traced:
@@ -124,7 +123,7 @@ class _Course:
         return observed
 
     def _points_at(self, instant: float) -> Floats:
-        """Go on to an instant; between two steps, interpolate."""
+        """Return the points at an instant, interpolated between two steps."""
         step = self._stepper.time_step
         self._act_until(instant - step)
         before, start = self._last
@@ -138,9 +137,9 @@ class _Course:
 
     def _trace(self, first: int) -> dict[int, Floats]:
         """
-        Return the observed points at timed goals, from the index `first` on, up to the next event of a hand.
+        Return the observed points at the timed goals from the index `first` to the next event of a hand.
 
-        The same as going to each by itself, in one call to the stepper.
+        The result is the same as for each goal by itself, but one call to the stepper does.
         """
         step = self._stepper.time_step
         self._close()
@@ -150,7 +149,8 @@ class _Course:
         arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
         count, last = 0, first
         for goal in self._trial.goals[first:]:
-            if goal.stable or goal.time > end or goal.time - self._time > LONGEST_TRACE * step or not all(
+            too_long = goal.time - self._time > 5000 * step  # a longer path would take much memory
+            if goal.stable or goal.time > end or too_long or not all(
                     self._trial.holds(hand, goal) for hand in arrived):
                 break
             count = max(0, math.ceil((goal.time - ROUNDING - self._time) / step))
@@ -170,7 +170,7 @@ class _Course:
         return dict(zip(range(first, last), self._layout.observe @ points, strict=True))
 
     def _act_until(self, until: float) -> None:
-        """Let hands act until then; where none moves, go on at most until the DLO is at rest."""
+        """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
         while self._time < until - ROUNDING:
             self._close()
             ends = [grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
@@ -184,7 +184,7 @@ class _Course:
             self._open_arrived()
 
     def _nothing_timed_before(self, instant: float) -> bool:
-        """Tell whether the time until then may be skipped: no goal is compared at an instant of it."""
+        """Tell whether time until an instant may be skipped: no timed goal lies in it."""
         return not any(not goal.stable and self._time < goal.time <= instant + self._stepper.time_step
                        for goal in self._trial.goals)
 
@@ -205,7 +205,7 @@ class _Course:
             self._hold()
 
     def _open_arrived(self) -> None:
-        """Open the hands that have arrived, unless the next goal shows them holding."""
+        """Open the hands that have arrived, unless the next goal shows them closed."""
         for grip in list(self._grips.values()):
             if grip.hand.end <= self._time + ROUNDING:
                 following = [goal for goal in self._ahead if goal.time > grip.hand.end]
@@ -213,13 +213,13 @@ class _Course:
                     self._release(grip)
 
     def _open(self, goal: Goal) -> None:
-        """Open the hands that a goal no longer shows holding."""
+        """Open the hands that have arrived and that a goal shows open."""
         for grip in list(self._grips.values()):
             if grip.hand.end < goal.time and not self._trial.holds(grip.hand, goal):
                 self._release(grip)
 
     def _let_go(self, nodes: tuple[int, ...]) -> None:
-        """Take nodes from the hands that hold them: another hand takes over."""
+        """Take nodes from the hands that hold them, because another hand grips them."""
         for name, grip in list(self._grips.items()):
             kept = [k for k, node in enumerate(grip.nodes) if node not in nodes]
             if not kept:
@@ -239,16 +239,13 @@ class _Course:
         targets = [grip.path[np.minimum(np.arange(count) + self._steps - grip.closed, len(grip.path) - 1)]
                    for grip in self._grips.values()]
         steps = np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3))
-        if path is None:
-            self._stepper.advance(steps)
-        else:
-            self._stepper.advance(steps, path)
+        self._stepper.advance(steps, path)
         self._time += count * self._stepper.time_step
         self._steps += count
         self._rests = False
 
     def _settle(self, limit: float) -> bool:
-        """Go on until all points moved less than a distance within a time; at once where it rests."""
+        """Simulate until the DLO is stable, at most for a limit [s]; tell whether it is stable then."""
         if self._rests:
             return True
         step = self._stepper.time_step
@@ -269,7 +266,7 @@ class _Course:
 
 
 def _largest_move(seen: Sequence[Floats]) -> float:
-    """Return how far any point was from where it first was, at any later time [m]."""
+    """Return the largest distance [m] of any point, at any later time, from its first position."""
     start, *later = seen
     return math.sqrt(max(float(np.square(points - start).sum(axis=1).max()) for points in later))
 
@@ -277,9 +274,9 @@ def _largest_move(seen: Sequence[Floats]) -> float:
 @lru_cache(maxsize=64)
 def _poses(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats]:
     """
-    Return where a hand is after 0 to `count` steps, (count + 1, 3) [m], and how it has turned since.
+    Return the positions (count + 1, 3) [m] of a hand after 0 to `count` steps, and its rotations since.
 
-    The same for every parameter set, so it is kept.
+    They are cached because they are the same for every parameter set.
     """
     positions, turns = hand.poses(start + step * np.arange(count + 1))
     return frozen_array(positions), frozen_array(turns @ turns[0].T)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rope: the nodes of a simulated DLO and all that the kernels work on, for every engine."""
+"""Rope: the nodes of a simulated DLO and the state that the kernels step, for both engines."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from dlo_calibration.simulation.rod import Rod, RodProperties
 
 class Rope:
     """
-    A DLO of N nodes at its start.
+    A DLO of N nodes at the start of a trial.
 
-    :param places: (N,) [m] of the nodes along the DLO at rest, from 0, increasing.
+    :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing.
     :param points: (N, 3) [m] at the start.
     :param velocities: (N, 3) [m/s] at the start.
     :param physical: physical values by parameter name, in SI units.
     :param time_step: [s].
     :param gravity: (3,) [m/s^2].
-    :param features: (N,) share of each node in the points annotated as feature; None: there are none.
+    :param features: (N,) number of points annotated as feature at each node; None: there are none.
     """
 
     def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
@@ -34,9 +34,9 @@ class Rope:
         points = np.array(points, dtype=float)
         contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
         kernels.start_distances(contact, points)
-        #: what the kernels work on; positions and velocities are changed in place
+        #: state of the kernels, which change positions and velocities in place
         self.state = kernels.RopeState(
-            points=points, velocities=np.array(velocities, dtype=float), wanted=np.zeros_like(points),
+            points=points, velocities=np.array(velocities, dtype=float), predicted=np.zeros_like(points),
             support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
             contact=contact)
 
@@ -46,17 +46,17 @@ class Rope:
         return self.state.points.copy()
 
     def hold(self, nodes: Sequence[int]) -> None:
-        """Let exactly these nodes follow a path from now on."""
+        """Let exactly these nodes follow given positions from now on."""
         self._rod.hold(nodes)
         self.state = self.state._replace(rod=self._rod.state)
 
 
 def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernels.SelfContact:
     """
-    Return the contact of a DLO with itself.
+    Return the state of contact of a DLO with itself.
 
     :param rest_lengths: (S,) [m] of its segments.
-    :param radius: [m].
+    :param radius: self-collision radius [m].
     :param friction: Coulomb coefficient.
     """
     segments, half = len(rest_lengths), rest_lengths / 2
@@ -71,5 +71,5 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
 
 
 def diverged() -> SimulationError:
-    """Return the error about a kernel that found no finite step."""
+    """Return the error for a kernel whose step is not finite."""
     return SimulationError('the rollout diverged: the chain is no longer finite')

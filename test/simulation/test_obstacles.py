@@ -70,7 +70,7 @@ SHAPE = '<link name="a"><collision><geometry>{}</geometry></collision></link>'
     (SHAPE.format('<heightmap/>'), 'the shape <heightmap>'),
     ('<link name="a"><contact><lateral_friction value="-1"/></contact></link>', 'lateral_friction -1'),
     (f'<link name="a">{BOX}</link>' + JOINT.format('a', 'b'), "the joint 'ab'"),
-    (f'<link name="a">{BOX}</link>{B}' + JOINT.format('a', 'b') + JOINT.format('b', 'a'), 'circle'),
+    (f'<link name="a">{BOX}</link>{B}' + JOINT.format('a', 'b') + JOINT.format('b', 'a'), 'loop'),
     (f'<link name="a">{BOX}</link>{B}' + 2 * JOINT.format('a', 'b'), "the joint 'ab'"),
 ])
 def test_what_cannot_be_used_is_refused_with_its_place(scene, inside, came):
