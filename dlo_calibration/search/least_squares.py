@@ -74,10 +74,11 @@ class LeastSquares(PlannedSearch):
         super().tell(observations)
 
     def _plan(self) -> Plan:
+        """Follow descents from the start points, lowest cost first, until the lowest minimum is confirmed."""
         starts = self._by_cost((yield from self._starts()))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
-        found, checks, looked = 1, 0, False  # `found`: how often the best minimum was reached
+        found, checks, looked = 1, 0, False  # times that the best minimum was reached; starts that checked it
         while found < 2 and checks < 2 and not self._hints.refines:
             starts = [one for one in starts if np.abs(one.point - best.point).max() > NEAR]
             if not best.ended and not best.has_rival(starts):
