@@ -26,11 +26,11 @@ from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.inference.trial_information import (
-    glimpse,
-    Knowledge,
-    knowledge,
+    Posterior,
+    posterior,
     simulated_information,
     TrialInformation,
+    without_repeated_goals,
 )
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
@@ -135,7 +135,7 @@ class LiveInformation:
                if key not in done]
         if all(key in informations for _, key in new):
             return
-        known, length = knowledge(trials, space, height, best, examination), mean_length(trials)
+        known, length = posterior(trials, space, height, best, examination), mean_length(trials)
         with closing(self._make_simulator(options)) as simulator, closing(ProcessExecutor(1)) as process:
             for trial, key in new:
                 fresh = key not in informations
@@ -157,7 +157,7 @@ class LiveInformation:
                     job.found.put(told)
 
 
-def _simulated(trial: Trial, known: Knowledge, space: ParameterSpace, simulator: Simulator, length: float,
+def _simulated(trial: Trial, known: Posterior, space: ParameterSpace, simulator: Simulator, length: float,
                table_height: float | None) -> Floats:
     """Return the information of a trial; the work of a process."""
     with closing(simulator):
@@ -192,7 +192,7 @@ def _fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:
 
 def _fingerprint(trial: Trial) -> bytes:
     """Return the start of a trial, its hands and its instants."""
-    seen = glimpse(trial)
+    seen = without_repeated_goals(trial)
     pieces: list[Any] = [seen.initial.points.tobytes(), b'' if seen.velocity is None else
                          seen.velocity.tobytes()]
     for hand in seen.hands:

@@ -23,7 +23,7 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.missing_parameters import missing_parameters
-from dlo_calibration.inference.slices import cut, seconds_for, Slices
+from dlo_calibration.inference.slices import seconds_for, simulate_slices, Slices
 from dlo_calibration.simulation.protocol import Simulator
 
 STOPPED_PATIENCE = 5.0  # s that a confirmation may still take once it was asked to stop
@@ -106,11 +106,11 @@ def sliced(result: CalibrationResult, options: Options, make_simulator: Simulato
     """
     Simulate slices around a result, in this thread; None where the engine fails.
 
-    They may be coarse, as the time for them is short: see `slices.cut`.
+    They may be coarse, as the time for them is short: see `slices.simulate_slices`.
     """
     try:
         with closing(make_simulator(options)) as simulator:
-            return cut(Evaluator(result.trials, result.space, simulator), result.best, result.std,
+            return simulate_slices(Evaluator(result.trials, result.space, simulator), result.best, result.std,
                        result.examination, seconds=seconds_for(result.seconds), should_stop=should_stop)
     except Exception:  # whatever the engine does, there is a page
         return None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a fit tells: intervals, what is identifiable, which action would tell more, what is missing."""
+"""What follows from a fit: intervals, which parameters are identifiable, the next action, what is missing."""
 
 from dlo_calibration.inference.advice import Advice, advise
 from dlo_calibration.inference.confirmation import Confirmation

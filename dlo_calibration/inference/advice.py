@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Advice: which action, if it were observed next, would tell most about what is not known.
+Advice: which action to observe next, so that the least certain parameter becomes more certain.
 
-Each candidate is simulated with the found parameters and with values beside
-them.  How far the simulated chains then lie apart, against the error of the
-residuals, is the information that the trial would add (the expected covariance
+Each candidate is simulated with the found parameters and with slightly different
+ones.  The differences of the simulated chains, divided by the error of the
+residuals, give the information that the trial would add (the expected covariance
 of Bayesian experimental design, Chaloner and Verdinelli, Bayesian Experimental
 Design: A Review, 1995, section 2).
 """
@@ -37,13 +37,12 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.simulation.protocol import Simulator
 
-WORTH_IT = 0.8  # an action is advised that brings the standard deviation below that share of today's
-MOST_SIMULATED = 3  # actions that are simulated beside all values
+WORTH_IT = 0.8  # an action is advised if it reduces the standard deviation to less than this share
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An action that could be observed next, in words and as a trial whose goals are not known yet."""
+    """An action that could be observed next, in words and as a trial whose goal chains are placeholders."""
 
     action: str
     words: str
@@ -53,14 +52,15 @@ class Candidate:
 @dataclass(frozen=True)
 class Advice:
     """
-    The action that would tell most about a parameter.
+    The action that would reduce the standard deviation of a parameter most.
 
     :param action: its name, as in a request.
     :param words: what to do.
-    :param parameter: that it would tell about.
-    :param std: of that parameter today, in the unit cube.
-    :param expected_std: with the action observed, too.
-    :param lower: expected 90 % interval in the unit cube, if the value stays; `upper` its other end.
+    :param parameter: the name of the parameter.
+    :param std: its present standard deviation in the unit cube.
+    :param expected_std: its expected standard deviation after the action was observed.
+    :param lower: lower end of the expected 90 % interval in the unit cube, around the present value;
+        `upper` is its upper end.
     """
 
     action: str
@@ -76,15 +76,16 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
            uncertainty: Uncertainty, length: float,
            should_stop: Callable[[], bool] = lambda: False) -> Advice | None:
     """
-    Return the action that reduces the largest uncertainty most; None where none helps, or nothing is open.
+    Return the action that reduces the largest standard deviation most.
 
-    Where none tells about the parameter that is known worst, the next one is looked at, as
-    long as it is not known well.  To spend few rollouts, each action that may show it is first simulated
-    beside the found value of that parameter only, then the `MOST_SIMULATED` best of them beside all.
+    If no action helps for the least certain parameter, the next one is tried, until all that are left
+    are identifiable.  To save rollouts, only that parameter is varied at first; for the three best
+    actions, all others are then varied, too.
 
     :param point: (d,) the found values in the unit cube.
-    :param uncertainty: today's, with a covariance.
+    :param uncertainty: the present one.
     :param length: of the DLO [m].
+    :return: None if no action helps, every parameter is identifiable, or there is no covariance.
     """
     if uncertainty.covariance is None:
         return None
@@ -94,7 +95,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
         try:
             return sensitivity(candidate.trial, space, simulator, point, uncertainty.std, length, shown=shown)
         except (SimulationError, InputError):
-            return None  # cannot be done with this DLO
+            return None  # this DLO does not allow the action
 
     for k in np.argsort(-uncertainty.std, kind='stable'):
         now = float(uncertainty.std[k])
@@ -111,12 +112,12 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
             if matrix is None:
                 possible.remove(candidate)
                 continue
-            # As if all else were known.
+            # The other parameters count as known: no more is possible.
             at_best = float((now**-2 + information(matrix, uncertainty.scale)[k, k])**-0.5)
             if at_best < WORTH_IT * now:
                 promising.append((at_best, candidate, matrix))
         best: tuple[float, Candidate] | None = None
-        for _, candidate, matrix in sorted(promising, key=lambda one: one[0])[:MOST_SIMULATED]:
+        for _, candidate, matrix in sorted(promising, key=lambda one: one[0])[:3]:
             if should_stop():
                 return None
             rest = simulated(candidate, ~alone)
@@ -135,14 +136,17 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
 def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats, std: Floats,
                 length: float, *, shown: NDArray[np.bool_] | None = None, at_rest: bool = True) -> Floats:
     """
-    Return (m, d) [m per unit cube]: how the simulated chains of a trial change with the parameters.
+    Return the (m, d) derivative of the simulated chains of a trial [m per unit cube].
 
-    Central differences as wide as each parameter is unknown, because the chains need not be linear over
-    that.
+    The steps of the central differences are the standard deviations, because the chains may be nonlinear
+    within such a distance.
 
-    :param shown: (d,) False for parameters that are not simulated, as they change nothing; None: all are.
-    :param at_rest: refuse rollouts that do not come to rest; else they count as they are at the limit.
-    :raises SimulationError: where a rollout diverges, or does not come to rest.
+    :param std: (d,) standard deviations in the unit cube.
+    :param length: of the DLO [m].
+    :param shown: (d,) False for parameters that the trial cannot show: their columns are zero without a
+        rollout; None: all are simulated.
+    :param at_rest: whether to refuse a rollout that does not come to rest; if not, its last state counts.
+    :raises SimulationError: if a rollout diverges, or does not come to rest.
     """
     columns: list[Floats] = []
     steps = np.clip(std, STEP, WIDEST)
@@ -157,13 +161,13 @@ def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point
                 raise SimulationError(f'trial {trial.name!r} does not come to rest')
             chains.append(rollout.chains.ravel())
         column = slope(beside[:, k], chains)
-        assert column is not None  # both are there
+        assert column is not None  # both sides were simulated
         columns.append(column)
     return np.stack(columns, axis=1)
 
 
 def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
-    """List actions that could be done next, from where a trial began."""
+    """Yield actions that could be observed next, starting from the initial chain of a trial."""
     chain = next((trial.initial for trial in trials if trial.velocity is None), trials[0].initial)
     length = chain.length
     along = chain.points[-1] - chain.points[0]
@@ -188,7 +192,7 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
         'lift the first end and lay it across the DLO, beyond two thirds of it', chain,
         GraspAndPlace(fraction=0.0, to=_beyond(chain, 0.7, across)))
     if gap < 0.05 * length:
-        return  # the ends are together: there is no line along which to move them
+        return  # the ends touch each other, so that no direction is defined
     yield from _candidate(f'grip both ends and push them {100 * gap / 3:.0f} cm together', chain,
                           TwoHands(fractions=(0.0, 1.0), motion='together', distance=gap / 3))
     apart = 1.03 * length - gap
@@ -199,7 +203,7 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
 
 
 def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:
-    """Return a place a tenth of the length beside the DLO."""
+    """Return the (3,) place [m] a tenth of the length beside the DLO, at a fraction of its arc length."""
     place = chain.resample(np.array([fraction * chain.length]))[0]
     return tuple(float(one) for one in place - 0.1 * chain.length * across / np.linalg.norm(across))
 
@@ -208,9 +212,9 @@ def _candidate(words: str, chain: Chain, named: NamedAction, watched: bool = Fal
     try:
         action: Action = named.action(chain)
     except InputError:
-        return  # not with a chain of this shape
+        return  # the shape of this chain does not allow the action
     held = tuple(hand.name for hand in action.hands) if named.hold else ()
-    goals = [Goal(chain, action.end + 1.0, held_by=held)]  # it is compared at rest
+    goals = [Goal(chain, action.end + 1.0, held_by=held)]  # a stable goal: the DLO is compared at rest
     if watched:
         times = np.linspace(action.start, action.end, 9)[1:]
         goals = [Goal(chain, float(time), stable=False, held_by=held) for time in times]

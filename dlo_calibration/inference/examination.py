@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Examination: what is looked at around the found parameters, once a search has ended.
+Examination: simulations around the found parameters, after a search has ended.
 
-Beside the found point, each parameter is moved both ways; a finer simulation,
-other draws of the noise of the initial chains, the default parameters, the optima
-without one trial after the other, and the ends of wide intervals are simulated.
-What that says about uncertainty is in `uncertainty`.
+These are simulated: each parameter changed in both directions; finer nodes and
+steps; initial chains with other noise; the default parameters; the optimum of the
+other trials for each trial that is left out; and the ends of wide intervals.
+The module `uncertainty` computes the intervals from them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
     DEVIATIONS,
-    left_out,
+    jackknife,
     noise_alone,
     optimum_shift,
     predictive_std,
@@ -32,12 +32,8 @@ from dlo_calibration.inference.uncertainty import (
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import distances, PointErrors
 
-SUSPECT = 0.01  # a parameter that is known no better than that is moved further, to look over kinks:
-WIDE = 0.1  # that far at least
-FADED = 0.9  # of the effect that the end of an interval should have: less, and the end is further away
-DOUBLINGS = 4  # of the way there; then it may be anywhere on the scale
-ARRIVED = 9.0  # square of the standard deviations that the next step may go, for each parameter
-MOST_FOLDS = 8  # of the cross-validation
+#: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
+SUSPECT = 0.01
 
 #: Takes (k, d) points, returns their residuals (m,) [m], None for a failure.
 Evaluate = Callable[[Floats], Sequence[Floats | None]]
@@ -46,20 +42,19 @@ Evaluate = Callable[[Floats], Sequence[Floats | None]]
 @dataclass(frozen=True)
 class Examination:
     """
-    What was found around a point.
+    The outcome of an examination.
 
     :param uncertainty: of the parameters.
-    :param jacobian: (m, d) derivative of the residuals there [m per unit cube].
-    :param regular: False where the search had not arrived at a minimum, so that
-        `uncertainty` does not hold.
-    :param noise: standard deviation of one coordinate of the observations, from
-        the roughness of the chains [m]; nan where they have too few points.
-    :param cross_validated: mean point error of trials that were left out of the
-        fit [m]; nan with one trial.
-    :param left_out: (f,) [m] mean point error of each fold of them; empty with one trial.
-    :param default_error: mean point error of the default parameters [m]; nan where they fail.
-    :param band: (p,) [m] how far each simulated goal point may lie elsewhere, one standard deviation.
-    :param evaluations: how many parameter sets were simulated for it.
+    :param jacobian: (m, d) derivative of the residuals [m per unit cube].
+    :param regular: False if the search has not reached a minimum, so that `uncertainty` is not valid.
+    :param noise: noise level: standard deviation of one measured coordinate, from the roughness of the
+        chains [m]; nan if they have too few points.
+    :param cross_validated: mean point error of trials that were left out of the fit [m]; nan with one trial.
+    :param left_out: (f,) mean point error of each fold of the cross-validation [m]; empty with one trial.
+    :param default_error: mean point error of the default parameters [m]; nan if they cannot be simulated.
+    :param band: (p,) standard deviation of each simulated goal point, from the covariance of the
+        parameters [m].
+    :param evaluations: number of parameter sets that were simulated.
     """
 
     uncertainty: Uncertainty
@@ -74,7 +69,7 @@ class Examination:
 
     @property
     def noise_alone(self) -> bool:
-        """Whether the residuals are noise alone."""
+        """Whether noise alone explains the residuals."""
         return noise_alone(self.uncertainty.residual, self.noise)
 
 
@@ -82,13 +77,14 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
             default: Floats, noise: float, finer: Evaluate | None = None,
             starts: Sequence[Evaluate] = (), thorough: bool = True) -> Examination:
     """
-    Examine a (d,) point of the unit cube that has `residuals` (m,) [m].
+    Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
 
+    :param evaluate: simulates the trials.
     :param default: (d,) the default parameters.
-    :param noise: see `Examination`.
-    :param finer: simulates with more nodes and a smaller step; None: not examined.
-    :param starts: simulate with other draws of the noise of the initial chains; may be none.
-    :param thorough: False: only as far as the trials that are left out ask for; intervals may be wrong.
+    :param noise: noise level, see `Examination` [m].
+    :param finer: simulates with more nodes and a smaller step; None: this is left out.
+    :param starts: each simulates with initial chains of other noise; may be empty.
+    :param thorough: False: only what cross-validation needs; the intervals may be wrong.
     """
     count = 0
 
@@ -99,9 +95,9 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
     at_default, = residuals_at(default[None, :])
     fit = _linearised(point, residuals, layout, residuals_at, noise, 2 if thorough else 0)
-    apart = _left_out_distances(fit, layout, residuals_at)
+    fold_errors = _left_out_errors(fit, layout, residuals_at)
     shift = None
-    if finer is not None:  # last: a worker keeps one simulator at a time
+    if finer is not None:  # late, because a worker keeps one simulator at a time
         count += 1
         fine, = finer(point[None, :])
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
@@ -110,19 +106,19 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     found = at_minimum(fit, layout, noise=noise, shift=shift,
                        starts=[one for one in drawn if one is not None])
     if thorough:
-        found = _reaching(fit, found, residuals_at)
+        found = _extended(fit, found, residuals_at)
     assert found.covariance is not None
     return Examination(
-        uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_arrived(fit, found),
-        cross_validated=float(np.concatenate(apart).mean()) if apart else float('nan'),
-        left_out=frozen_array([float(fold.mean()) for fold in apart]),
+        uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
+        cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
+        left_out=frozen_array([float(fold.mean()) for fold in fold_errors]),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
         band=frozen_array(predictive_std(fit.jacobian, found.covariance)), evaluations=count)
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
                 noise: float, widenings: int) -> Linearisation:
-    """Return the residuals with their derivatives, by steps that are as wide as a parameter is unknown."""
+    """Return the linearised residuals; the steps for uncertain parameters are their standard deviations."""
     dimension = len(point)
 
     def columns(wanted: Sequence[int], steps: Floats) -> list[Floats]:
@@ -136,30 +132,32 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     jacobian = np.stack(columns(range(dimension), steps), axis=1)
     for _ in range(widenings):
         std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
-        wider = np.where(std > SUSPECT, np.clip(std, WIDE, WIDEST), steps)
+        wider = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), steps)
         weak = np.flatnonzero(wider > 1.5 * steps).tolist()
         if not weak:
             break
         steps[weak] = wider[weak]
         for k, column in zip(weak, columns(weak, steps), strict=True):
-            # A small difference may show a kink where there is no slope: the lesser effect is believed.
+            # A small step may see a kink and no slope, so that the smaller effect counts.
             if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
                 jacobian[:, k] = column
     return Linearisation(point, residuals, jacobian)
 
 
-def _reaching(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) -> Uncertainty:
+def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) -> Uncertainty:
     """
-    Return intervals that reach to where the residuals have really changed enough, and not less.
+    Return intervals that are extended to where the residuals really change as much as the linear fit says.
 
-    The effect of a stiffness fades as it grows: what is a clear loss on one side may be none on the other.
+    The effect of a stiffness fades as it grows: one end of an interval may fit clearly worse, the other not.
+    An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
+    after that, it is the end of the scale.
     """
     point, ends, limits = fit.point, np.stack([found.lower, found.upper]), (0.0, 1.0)
     excited = np.flatnonzero(found.excited)
-    needed = DEVIATIONS * found.std * FADED
+    needed = DEVIATIONS * found.std * 0.9
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
               if found.std[k] > SUSPECT and ends[side, k] != limits[side]]
-    for _ in range(DOUBLINGS):
+    for _ in range(4):
         if not unsure:
             break
         there = np.tile(point, (len(unsure), 1))
@@ -180,20 +178,20 @@ def _reaching(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) ->
     return replace(found, lower=frozen_array(ends[0]), upper=frozen_array(ends[1]))
 
 
-def _arrived(fit: Linearisation, found: Uncertainty) -> bool:
-    """Tell whether the next Gauss-Newton step stays among values that the trials cannot tell apart."""
+def _converged(fit: Linearisation, found: Uncertainty) -> bool:
+    """Tell whether the next Gauss-Newton step is small: 3 standard deviations (squared: 9) per parameter."""
     free = replace(fit, residuals=Huber.of(fit.residuals).clipped(fit.residuals)).columns(
         found.excited & ~found.at_bound)
     count = len(free.point)
     step = free.step(np.eye(count) * found.residual**2)
-    return -float(free.gradient @ step) <= ARRIVED * count * found.scale**2
+    return -float(free.gradient @ step) <= 9.0 * count * found.scale**2
 
 
-def _left_out_distances(fit: Linearisation, layout: ResidualLayout, residuals_at: Evaluate) -> list[Floats]:
-    """Return the point errors [m] of each fold of the trials at the optimum of the others; none of one."""
+def _left_out_errors(fit: Linearisation, layout: ResidualLayout, residuals_at: Evaluate) -> list[Floats]:
+    """Return the point errors [m] of each of up to 8 folds at the optimum of the others; [] for one trial."""
     if len(layout.shapes) < 2:
         return []
-    folds = layout.folds(MOST_FOLDS)
-    moved = left_out(fit, folds, fit.ridge)
+    folds = layout.folds(8)
+    moved = jackknife(fit, folds, fit.ridge)
     seen = residuals_at(np.clip(fit.point + np.clip(moved, -WIDEST, WIDEST), 0.0, 1.0))
     return [distances(one[rows]) for rows, one in zip(folds, seen, strict=True) if one is not None]

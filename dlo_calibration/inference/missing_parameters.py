@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Missing parameters: which of those that were held fixed would explain what a fit leaves over."""
+"""Missing parameters: which parameters that were held fixed would explain the residuals of a fit."""
 
 from __future__ import annotations
 
@@ -16,21 +16,18 @@ from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
 
-PARTS = 'parts'  # the name where it is parts of different stiffness that are missing
-TRIED_PARTS = 4  # so that a middle stiffer than both ends shows
-MOVE = 0.15  # that a parameter is moved, in the unit cube;
-LONG_MOVE = 0.5  # from where it is nothing at all
-FURTHEST = 2.0  # times that move, to which its effect is trusted to grow
-WORTH_TELLING = 0.1  # of the squares that are left
+PARTS = 'parts'  # stands for parts of different bending stiffness
+MOVE = 0.15  # change of a parameter, in the unit cube: well above the noise of a simulation
+FURTHEST = 2.0  # the effect is extrapolated to this multiple of the change, but no further
 
 
 @dataclass(frozen=True)
 class MissingParameter:
     """
-    A parameter that a calibration held fixed, and that the trials ask for.
+    A parameter that a calibration held fixed although it would explain part of the residuals.
 
     :param name: of the parameter, or PARTS.
-    :param share: of the sum of squares left over, that it would explain.
+    :param share: the part of the sum of squared residuals that it would explain, 0..1.
     """
 
     name: str
@@ -40,14 +37,14 @@ class MissingParameter:
 def missing_parameters(evaluator: Evaluator, fit: Linearisation,
                        should_stop: Callable[[], bool] = lambda: False) -> tuple[MissingParameter, ...]:
     """
-    Return what would explain at least a tenth of what is left, most first.
+    Return the parameters that would explain at least a tenth of the squared residuals, largest share first.
 
-    Each parameter that was held fixed is moved once; what counts is its effect
-    on the residuals that the free ones cannot have (a score test: Rao, Linear
-    Statistical Inference and Its Applications, 1973, 6e.3).
+    Each parameter that was held fixed is changed once.  Only the part of its
+    effect counts that the free parameters cannot imitate (a score test: Rao,
+    Linear Statistical Inference and Its Applications, 1973, 6e.3).
 
     :param evaluator: of the calibration.
-    :param fit: the residuals around what was found.
+    :param fit: the residuals at the found parameters, linearised.
     :raises CancelledError: when stopped.
     """
     roots = Huber.of(fit.residuals).roots(fit.residuals)
@@ -62,42 +59,42 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
             if seen is not None:
                 columns.append(perpendicular(weighted.jacobian, roots * (seen - fit.residuals)))
         share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
-        if share >= WORTH_TELLING:
+        if share >= 0.1:
             found.append(MissingParameter(name, share))
     return tuple(sorted(found, key=lambda one: -one.share))
 
 
 def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Floats]]:
-    """Yield names, the spaces with what is added, and the (k, a) places of that in the unit cube."""
+    """Yield each name, the space with its a parameters added, and k values (k, a) to try in the unit cube."""
     for parameter in PARAMETERS:
         name = parameter.name
         if name in space.free or name in PART_NAMES or name == 'mass' and not space.mass_known:
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE
-        step = LONG_MOVE if _is_nothing(parameter, now) else MOVE
+        step = 0.5 if _is_absent(parameter, now) else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
                np.array([[now + step if now + step <= 1 else now - step]]))
     if space.parts == 1 and 'flexibility' in space.free:
-        divided = space.divided(TRIED_PARTS)
-        even = np.array([BY_NAME[name].default for name in PART_NAMES[:TRIED_PARTS - 1]]) / SCALE
+        divided = space.divided(4)  # four parts can show a middle that is stiffer than both ends
+        even = np.array([BY_NAME[name].default for name in PART_NAMES[:3]]) / SCALE
         yield PARTS, divided, even + MOVE * np.eye(len(even))
 
 
-def _is_nothing(parameter: Parameter, now: float) -> bool:
-    """Tell whether a parameter means at the lower end of a logarithmic scale that there is nothing of it."""
+def _is_absent(parameter: Parameter, now: float) -> bool:
+    """Tell whether the effect is absent, as the value is at the lower end of a logarithmic scale."""
     return parameter.neutral == 0 and not parameter.linear and now == 0
 
 
 def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:
-    """Return the share of (m,) what is left that a combination of (m,) columns, not too long, takes away."""
+    """Return the share of the squares of `left` (m,) that a bounded combination of (m,) columns explains."""
     from scipy.optimize import lsq_linear
 
     matrix = np.stack(columns, axis=1) if columns else np.zeros((len(left), 0))
     total = float(left @ left)
     if not total > 0 or not float(np.square(matrix).sum()) > 0:
         return 0.0
-    # What is nothing at its default cannot be less.
+    # An effect that is absent at its default cannot be negative.
     least = 0.0 if parameter is not None and parameter.neutral == 0 else -FURTHEST
     steps = lsq_linear(matrix, -left, (least, FURTHEST), method='bvls').x
     rest = left + matrix @ steps

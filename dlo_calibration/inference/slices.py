@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slices: how the fit worsens when one or two parameters leave the found values, and the others stay."""
+"""Slices: how the fit worsens when one or two parameters change and the others keep their found values."""
 
 from __future__ import annotations
 
@@ -19,21 +19,19 @@ from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import SCALE
 
-LEVELS = (4, 8, 16)  # intervals of a line, coarse first
-FINEST_PLANE = 8  # intervals of a plane: twice as many would take four times as long
-REACH = 4.0  # standard deviations that a slice goes to each side,
-NARROWEST = 10.0  # but so far at least (0..100)
-CORRELATED = 0.5  # from which on a second pair of parameters is looked at
+LEVELS = (4, 8, 16)  # intervals of a line, coarse first: each level uses the points of the one before
+NARROWEST = 10.0  # a slice extends at least this far to each side (0..100)
 
 
 @dataclass(frozen=True)
 class Line:
     """
-    One parameter varies.
+    The fit while one parameter varies.
 
-    :param values: (k,) on the 0..100 scale.
-    :param scores: (k,) difference scores [cm]; infinite where a simulation failed.
-    :param errors: (k,) root mean square point errors [m]; infinite where it failed.
+    :param name: of the parameter.
+    :param values: (k,) of the parameter on the 0..100 scale.
+    :param scores: (k,) difference scores [cm]; infinite if the simulation failed.
+    :param errors: (k,) root mean square point errors [m]; infinite if the simulation failed.
     """
 
     name: str
@@ -45,9 +43,12 @@ class Line:
 @dataclass(frozen=True)
 class Plane:
     """
-    Two parameters vary: as `Line`, with (k, k) scores and errors, the first parameter along the first axis.
+    The fit while two parameters vary.
 
-    :param values: (2, k) on the 0..100 scale.
+    :param names: of the two parameters.
+    :param values: (2, k) of the parameters on the 0..100 scale.
+    :param scores: (k, k) difference scores [cm] as in `Line`; the first axis is the first parameter.
+    :param errors: (k, k) root mean square point errors [m], likewise.
     """
 
     names: tuple[str, str]
@@ -59,10 +60,10 @@ class Plane:
 @dataclass(frozen=True)
 class Slices:
     """
-    A line through what was found per parameter, and planes of the pairs that depend on each other most.
+    A line through the found values for each parameter, and planes for the most correlated pairs.
 
-    :param evaluations: parameter sets that were simulated for them.
-    :param complete: False where there was no time for all of it: slices are coarse or missing then.
+    :param evaluations: number of parameter sets that were simulated.
+    :param complete: False if the time was too short: some slices are coarse or missing.
     """
 
     lines: tuple[Line, ...]
@@ -71,56 +72,57 @@ class Slices:
     complete: bool
 
 
-def cut(evaluator: Evaluator, best: Evaluation, std: Floats, examination: Examination | None, *,
+def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examination: Examination | None, *,
         seconds: float, should_stop: Callable[[], bool] = lambda: False,
         clock: Callable[[], float] = time.monotonic) -> Slices:
     """
-    Simulate slices around what was found, the coarse ones first, until the time is up.
+    Simulate slices around the found values, coarse ones first, until the time is up.
 
-    :param best: what was found.
-    :param std: (d,) its standard deviations in the unit cube.
-    :param examination: of it; None where there was none.
-    :param seconds: that it may take.
-    :param should_stop: asked between trials; once True, what is there is returned.
+    :param best: the evaluation of the found values.
+    :param std: (d,) their standard deviations in the unit cube.
+    :param examination: of their surroundings; None if there was none.
+    :param seconds: time limit [s].
+    :param should_stop: asked between trials; once True, the slices so far are returned.
+    :param clock: the time [s].
     """
     end = clock() + seconds
-    cutter = _Cutter(evaluator, best, std, lambda: should_stop() or clock() > end)
+    grid = _Grid(evaluator, best, std, lambda: should_stop() or clock() > end)
     dimension = evaluator.space.dimension
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()
     try:
         for level in LEVELS:
-            lines = tuple(cutter.line(k, level) for k in range(dimension))
-            if level <= FINEST_PLANE:
-                planes = tuple(cutter.plane(pair, level) for pair in pairs(dimension, examination))
+            lines = tuple(grid.line(k, level) for k in range(dimension))
+            if level <= 8:  # a plane of 16 intervals would take four times as long
+                planes = tuple(grid.plane(pair, level) for pair in pairs(dimension, examination))
     except CancelledError:
-        return Slices(lines, planes, cutter.count, False)
-    return Slices(lines, planes, cutter.count, True)
+        return Slices(lines, planes, grid.count, False)
+    return Slices(lines, planes, grid.count, True)
 
 
 def seconds_for(calibration: float) -> float:
-    """Return how long slices may take [s], by how long the calibration took: a fifth, 5 to 60 s."""
+    """Return the time limit of the slices [s]: a fifth of that of the calibration [s], but 5 to 60 s."""
     return min(max(5.0, 0.2 * calibration), 60.0)
 
 
 def pairs(dimension: int, examination: Examination | None) -> list[tuple[int, int]]:
-    """Return the indices of a pair or two of parameters, those that depend on each other most."""
+    """Return the indices of the most correlated pair of parameters, and of a second pair above 0.5."""
     possible = list(combinations(range(dimension), 2))
     if examination is None or examination.uncertainty.correlations is None:
         return possible[:1]
     size, excited = np.abs(examination.uncertainty.correlations), examination.uncertainty.excited
     order = sorted((pair for pair in possible if excited[pair[0]] and excited[pair[1]]),
                    key=lambda pair: -float(size[pair]))
-    return order[:1] + [pair for pair in order[1:2] if size[pair] >= CORRELATED]
+    return order[:1] + [pair for pair in order[1:2] if size[pair] >= 0.5]
 
 
-class _Cutter:
-    """Evaluates points of slices, each once."""
+class _Grid:
+    """The points of the slices, each evaluated once; a slice extends 4 standard deviations to each side."""
 
     def __init__(self, evaluator: Evaluator, best: Evaluation, std: Floats, late: Callable[[], bool]) -> None:
         self._evaluator, self._late = evaluator, late
         self._best = best
-        reach = np.maximum(REACH * std, NARROWEST / SCALE)
+        reach = np.maximum(4.0 * std, NARROWEST / SCALE)
         self._ends = [(max(0.0, value - one), min(1.0, value + one))
                       for value, one in zip(best.point.tolist(), reach.tolist(), strict=True)]
         self._seen: dict[tuple[float, ...], Evaluation] = {}
@@ -128,25 +130,25 @@ class _Cutter:
 
     @property
     def count(self) -> int:
-        """How many were simulated."""
+        """Number of simulated points."""
         return len(self._seen)
 
     def line(self, k: int, level: int) -> Line:
-        """Vary one parameter; the found value is among its values."""
-        values = np.unique([*self._grid(k, level), self._best.point[k]])
+        """Vary one parameter; its values include the found one."""
+        values = np.unique([*self._values(k, level), self._best.point[k]])
         found = [self._at({k: float(value)}) for value in values]
         scores, errors = _outcomes(found)
         return Line(self._names[k], frozen_array(values * SCALE), frozen_array(scores), frozen_array(errors))
 
     def plane(self, pair: tuple[int, int], level: int) -> Plane:
         """Vary two parameters."""
-        one, two = (self._grid(k, level) for k in pair)
+        one, two = (self._values(k, level) for k in pair)
         found = [self._at({pair[0]: float(a), pair[1]: float(b)}) for a in one for b in two]
         scores, errors = (values.reshape(len(one), len(two)) for values in _outcomes(found))
         return Plane((self._names[pair[0]], self._names[pair[1]]), frozen_array(np.stack([one, two]) * SCALE),
                      frozen_array(scores), frozen_array(errors))
 
-    def _grid(self, k: int, level: int) -> Floats:
+    def _values(self, k: int, level: int) -> Floats:
         low, high = self._ends[k]
         return np.linspace(low, high, level + 1)
 
@@ -165,6 +167,6 @@ class _Cutter:
 
 
 def _outcomes(found: Sequence[Evaluation]) -> Iterator[Floats]:
-    """Give the scores [cm] and the root mean square errors [m]."""
+    """Yield the scores [cm], then the root mean square errors [m]."""
     yield np.array([one.score for one in found])
     yield np.array([np.inf if one.errors is None else one.errors.rms for one in found])

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Trial information: what one trial tells about the parameters, beside what is known without it.
+Trial information: how much more certain one trial makes the parameters, before any calibration.
 
 The information of a trial is that of linear regression: J^T J / scale^2, with the
-change J of its simulated chains with the parameters and the error of the
-residuals.  Informations add up, from a prior that knows nothing but the scale's
-ends, so that the standard deviations before and after a trial follow without a
-calibration (Chaloner and Verdinelli, Bayesian Experimental Design: A Review,
-1995, section 2).
+derivative J of its simulated chains and the error of the residuals.  It is added
+to the information of the trials before it; the prior is uniform on the scale.
+The standard deviations before and after a trial follow without a calibration
+(Chaloner and Verdinelli, Bayesian Experimental Design: A Review, 1995, section 2).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from dlo_calibration.evaluation.linearisation import information, standard_devia
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.advice import sensitivity
 from dlo_calibration.inference.examination import Examination
-from dlo_calibration.inference.uncertainty import unknown, UNKNOWN_STD
+from dlo_calibration.inference.uncertainty import prior_information, UNKNOWN_STD
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
@@ -32,22 +31,20 @@ from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.simulation.protocol import Simulator
 
-NEW = 0.6  # of the standard deviation is left at most, where a trial tells something; a repeat leaves 0.71
-NOTHING = 0.95  # share of the standard deviation of what is not known at all that is left at least
-# Until a result says better, a residual's error is that of a simulation with the right parameters and that
-# of the noise [m], assumed where chains have too few points to tell; that many neighbours count as one.
-SIMULATION_ERROR, ASSUMED_NOISE, ALIKE = 1e-3, 2e-3, 4.0
+#: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
+NEW = 0.6
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class Posterior:
     """
-    What is known of d parameters, in the unit cube, after some trials.
+    The posterior of d parameters after some trials, in the unit cube.
 
     :param names: of the parameters.
-    :param point: (d,) their values, as far as they are known.
+    :param point: (d,) their estimated values.
     :param information: (d, d) inverse of their covariance.
-    :param scale: error of one coordinate's residual as it counts, neighbours that err alike as one [m].
+    :param scale: standard deviation of one coordinate's residual, enlarged because neighbouring residuals
+        are correlated [m].
     """
 
     names: tuple[str, ...]
@@ -64,20 +61,21 @@ class Knowledge:
         """(d,) standard deviations."""
         return standard_deviations(self.information)
 
-    def after(self, information: Floats) -> Knowledge:
-        """Return what is known with a trial of that (d, d) information, too."""
+    def after(self, information: Floats) -> Posterior:
+        """Return the posterior after one more trial, which has that (d, d) information."""
         return replace(self, information=self.information + information)
 
 
 @dataclass(frozen=True, eq=False)
 class TrialInformation:
     """
-    What one trial adds.
+    How one trial changes the standard deviations of the parameters.
 
     :param trial: its name.
     :param names: of the d parameters.
-    :param before: (d,) standard deviations without it, in the unit cube; `after` with it.
-    :param problem: why they are not known (nan), in words; empty where they are.
+    :param before: (d,) standard deviations without the trial, in the unit cube.
+    :param after: (d,) standard deviations with the trial.
+    :param problem: why they are unknown (nan); empty if they are known.
     """
 
     trial: str
@@ -92,33 +90,34 @@ class TrialInformation:
 
     @classmethod
     def unknown(cls, trial: str, names: tuple[str, ...], problem: str) -> TrialInformation:
-        """Return that of a trial that could not be simulated."""
+        """Return the information of a trial that could not be simulated: unknown."""
         nothing = np.full(len(names), np.nan)
         return cls(trial, names, nothing, nothing, problem)
 
     @property
-    def told(self) -> tuple[str, ...]:
-        """Names of the parameters that it tells something new about."""
+    def improved(self) -> tuple[str, ...]:
+        """Names of the parameters that the trial makes more certain."""
         return tuple(name for name, before, after in zip(self.names, self.before, self.after, strict=True)
                      if after < NEW * before)
 
     @property
     def words(self) -> str:
-        """The same in a sentence."""
+        """One sentence for the user."""
         if self.problem:
-            return f'what {self.trial} tells is not known: {self.problem}'
-        told = self.told
-        if not told:
+            return f'the information of {self.trial} is unknown: {self.problem}'
+        improved = self.improved
+        if not improved:
             return f'{self.trial} adds nothing new: repeat it only to average noise'
-        shown = [f'{name} (± {SCALE * before:.1f} -> ± {SCALE * after:.1f} of 100)'
-                 for name, before, after in zip(self.names, self.before, self.after, strict=True)
-                 if name in told]
-        rest = ', '.join(name for name in self.names if name not in told)
-        return f'{self.trial} tells {", ".join(shown)}' + (f'; nothing new about {rest}' if rest else '')
+        change = ', '.join(f'± {SCALE * before:.1f} -> ± {SCALE * after:.1f}'
+                           for name, before, after in zip(self.names, self.before, self.after, strict=True)
+                           if name in improved)
+        rest = ', '.join(name for name in self.names if name not in improved)
+        nothing = f'; it adds nothing about {rest}' if rest else ''
+        return f'{self.trial} makes {", ".join(improved)} more certain ({change} of 100){nothing}'
 
     @property
     def values(self) -> dict[str, Any]:
-        """The standard deviations on the 0..100 scale, by the keys of a status; empty where not known."""
+        """Standard deviations on the 0..100 scale, under the keys of a status; empty if they are unknown."""
         if self.problem:
             return {}
         return {f'{key}_{name}': float(std) * SCALE for key, column in (
@@ -126,36 +125,38 @@ class TrialInformation:
             for name, std in zip(self.names, column, strict=True)}
 
 
-def knowledge(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None,
-              best: Floats | None = None, examination: Examination | None = None) -> Knowledge:
+def posterior(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None,
+              best: Floats | None = None, examination: Examination | None = None) -> Posterior:
     """
-    Return what is known without the trials that were not calibrated on.
+    Return what is known before the trials that were not calibrated yet.
 
-    That is what a calibration found, and its covariance where that holds.  Without a
-    calibration, the values that the chains alone say, or the defaults.
+    After a calibration, these are the values that it found, with their covariance if it is valid.
+    Without one, they are the values estimated from the chains alone, or the defaults.
 
-    :param table_height: [m]; None where there is no table.
-    :param best: (d,) what a calibration of the same parameters found; None: there was none.
-    :param examination: of that; None where there was no time for it.
+    :param table_height: [m]; None if there is no table.
+    :param best: (d,) the values that a calibration of the same parameters found; None: there was none.
+    :param examination: of that calibration; None if it had no time for one.
     """
     if best is not None and examination is not None and examination.regular:
         found = examination.uncertainty
         assert found.covariance is not None
-        return Knowledge(space.free, best, np.asarray(np.linalg.inv(found.covariance)), found.scale)
+        return Posterior(space.free, best, np.asarray(np.linalg.inv(found.covariance)), found.scale)
     if best is None:
         start = start_point(trials, space, table_height)
         best = np.where(np.isnan(start), space.default_point(), start)
-    rough = noise(trials)
-    residual = np.hypot(ASSUMED_NOISE if np.isnan(rough) else rough, SIMULATION_ERROR)
-    return Knowledge(space.free, best, unknown(space.dimension), float(residual * np.sqrt(ALIKE)))
+    # Before a calibration, a residual is noise (2 mm if it cannot be estimated) and the error of a simulation
+    # with the right parameters (1 mm); four neighbours are assumed to count as one.
+    level = noise(trials)
+    residual = np.hypot(2e-3 if np.isnan(level) else level, 1e-3)
+    return Posterior(space.free, best, prior_information(space.dimension), float(residual * np.sqrt(4.0)))
 
 
-def glimpse(trial: Trial) -> Trial:
+def without_repeated_goals(trial: Trial) -> Trial:
     """
-    Return a trial with those goals only that tell something of their own.
+    Return a trial without the goals that add little.
 
-    Of goals of the same rest, the first; of those in motion, some, evenly spread.
-    What is left does not change while a tracker goes on to show a DLO at rest.
+    Of several goals of the same DLO at rest, the first stays; of those in motion, a few stay, evenly spread.
+    The outcome does not change while a tracker continues to show a DLO at rest.
     """
     goals: list[Goal] = []
     moving = [goal for goal in trial.goals if not goal.stable]
@@ -170,33 +171,37 @@ def glimpse(trial: Trial) -> Trial:
     return replace(trial, goals=tuple(goals))
 
 
-def simulated_information(trial: Trial, known: Knowledge, space: ParameterSpace, simulator: Simulator,
+def simulated_information(trial: Trial, known: Posterior, space: ParameterSpace, simulator: Simulator,
                           length: float, table_height: float | None) -> Floats:
     """
-    Return the (d, d) information of one trial, simulated beside what is known.
+    Return the (d, d) information of one trial, from simulations around the known values.
 
-    A parameter that the trial surely cannot show is not simulated.
+    A parameter that the trial certainly cannot show is not varied.
 
     :param length: of the DLO [m].
-    :param table_height: [m]; None where there is no table.
-    :raises SimulationError: where it cannot be simulated.
+    :param table_height: [m]; None if there is no table.
+    :raises SimulationError: if the trial cannot be simulated.
     """
     shown = excites([trial], space, table_height)[0]
-    matrix = sensitivity(glimpse(trial), space, simulator, known.point, known.std, length,
+    matrix = sensitivity(without_repeated_goals(trial), space, simulator, known.point, known.std, length,
                          shown=shown, at_rest=False)
     return information(matrix, known.scale)
 
 
-def told_by(trials: Sequence[Trial], examination: Examination) -> Floats:
-    """Return (T, d) standard deviations in the unit cube that each calibrated trial alone would give."""
-    scale, prior = examination.uncertainty.scale, unknown(examination.jacobian.shape[1])
+def std_of_each_alone(trials: Sequence[Trial], examination: Examination) -> Floats:
+    """Return (T, d): the standard deviations in the unit cube that each calibrated trial would give alone."""
+    scale, prior = examination.uncertainty.scale, prior_information(examination.jacobian.shape[1])
     return np.array([standard_deviations(information(examination.jacobian[rows], scale) + prior)
                      for rows in ResidualLayout.of(trials).rows])
 
 
-def silent(trials: Sequence[Trial], examination: Examination | None) -> tuple[str, ...]:
-    """Return the names of the trials of a calibration that told nothing; none where that is not known."""
+def uninformative(trials: Sequence[Trial], examination: Examination | None) -> tuple[str, ...]:
+    """
+    Return the names of the calibrated trials that say nothing about any parameter; () if that is unknown.
+
+    Each of them alone would leave every standard deviation above 95 % of that of the prior.
+    """
     if examination is None or not examination.regular:
         return ()
-    return tuple(trial.name for trial, std in zip(trials, told_by(trials, examination), strict=True)
-                 if (std > NOTHING * UNKNOWN_STD).all())
+    return tuple(trial.name for trial, std in zip(trials, std_of_each_alone(trials, examination), strict=True)
+                 if (std > 0.95 * UNKNOWN_STD).all())

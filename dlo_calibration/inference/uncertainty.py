@@ -2,20 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Uncertainty: what a calibration does not know, in the unit cube of its parameters.
+Uncertainty: the covariance and the intervals of the calibrated parameters, in the unit cube.
 
-Where the search ended in a regular minimum, the covariance follows from the
-Jacobian of the residuals there.  Four things are added to what a textbook's
-formula says, because alone it is several times too small for real DLOs:
+If the search ended in a regular minimum, the covariance follows from the
+Jacobian of the residuals there.  The textbook's formula alone is several times
+too small for real DLOs.  Four things are therefore added:
 
-- neighbouring points err alike, so that they count as fewer;
-- the initial chain of each trial is measured, too, and with it the length and the shape of the DLO;
-- where the model cannot explain the residuals, the trials disagree with each
-  other, and how far says more than how many points there are (the larger of what leaving one
-  out and drawing as many anew tell);
+- the errors of neighbouring points are correlated, so that these count as fewer;
+- the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
+- if the model cannot explain the residuals, the trials disagree with each other; the jackknife and
+  the bootstrap over the trials measure how much, and the larger of both counts;
 - the step and the nodes of the simulation move the optimum.
 
-Where it did not, as in a random search, the good evaluations lie apart.
+If it did not, as in a random search, the spread of the best evaluations is used.
 """
 
 from __future__ import annotations
@@ -31,15 +30,11 @@ from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats, frozen_array
 
-UNKNOWN_STD = 1 / np.sqrt(12)  # of a value anywhere in 0..1
-IDENTIFIABLE_STD = UNKNOWN_STD / 4
-WEAK_STD = UNKNOWN_STD / 2
-DEVIATIONS = 1.645  # that half an interval of 90 % has, of a normal distribution
-AT_BOUND = 0.002  # of an end of the scale: what lies nearer may lie beyond
-MODEL_ERROR = 1.6  # residuals larger than the noise by that factor are not noise alone
-FEWEST_TRIALS = 3  # whose disagreement says something
-REMAINING = 2.0  # times the change by a simulation twice as fine is missing: the error is of first order
-INVOLVED = 0.3  # share of a unit vector that makes a parameter part of a combination
+UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is the prior
+IDENTIFIABLE_STD = UNKNOWN_STD / 4  # below it, a parameter is identifiable; from twice that on, it is not
+DEVIATIONS = 1.645  # half the width of a 90 % interval, in standard deviations of a normal distribution
+MODEL_ERROR = 1.6  # noise alone does not explain residuals that exceed the noise level by this factor
+INVOLVED = 0.3  # a parameter belongs to a combination if its share of the unit vector is at least this
 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
 
@@ -59,15 +54,15 @@ class Scored(Protocol):
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    What is known of d parameters, in the unit cube.
+    How certain d parameters are, in the unit cube.
 
     :param std: (d,) standard deviation.
     :param lower: (d,) lower end of the 90 % interval; `upper` (d,) its upper end.
-    :param excited: (d,) False where no trial tells anything at all.
-    :param at_bound: (d,) True where the best value is at an end of the scale.
-    :param covariance: (d, d); None where only the spread of evaluations is known.
-    :param residual: standard deviation of one coordinate's residual [m]; nan where not estimated.
-    :param scale: that residual as it counts, neighbours that err alike as one [m].
+    :param excited: (d,) False for a parameter that has no effect on any trial.
+    :param at_bound: (d,) True if the best value is at an end of the scale.
+    :param covariance: (d, d); None if only the spread of the evaluations is known.
+    :param residual: standard deviation of one coordinate's residual [m]; nan if it was not estimated.
+    :param scale: the same, enlarged because neighbouring residuals are correlated [m].
     """
 
     std: Floats
@@ -81,15 +76,15 @@ class Uncertainty:
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """Return one of the three verdicts for each parameter."""
+        """One of the three verdicts for each parameter."""
         return tuple(
-            NOT_IDENTIFIABLE if not excited or std >= WEAK_STD else
+            NOT_IDENTIFIABLE if not excited or std >= UNKNOWN_STD / 2 else
             IDENTIFIABLE if std < IDENTIFIABLE_STD else WEAK
             for std, excited in zip(self.std, self.excited, strict=True))
 
     @property
     def correlations(self) -> Floats | None:
-        """(d, d) correlations of the parameters; None where not known."""
+        """(d, d) correlations of the parameters; None if they are unknown."""
         if self.covariance is None:
             return None
         std = np.sqrt(np.diag(self.covariance))
@@ -97,7 +92,7 @@ class Uncertainty:
 
     @property
     def undetermined(self) -> tuple[Floats, ...]:
-        """Unit vectors (d,) of combinations of two or more parameters that the trials leave open."""
+        """Unit vectors (d,) of combinations of two or more parameters that are not identifiable."""
         if self.covariance is None:
             return ()
         values, vectors = np.linalg.eigh(self.covariance)
@@ -108,20 +103,19 @@ class Uncertainty:
 
 
 def good_count(evaluations: int) -> int:
-    """Return how many of that many evaluations count as good: the best 5 %, 8 at least."""
+    """Return how many of the evaluations count as good: the best 5 %, but at least 8."""
     return max(8, round(0.05 * evaluations))
 
 
 def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     """
-    Return how far the parameters of the best evaluations lie apart.
+    Return the spread of the parameters of the best evaluations.
 
     A parameter that the trials determine has similar values in all good
-    evaluations; one that they do not can be anything.  `std` is the root mean
-    square distance of the best 5 % (8 at least) from the (d,) point `best`;
-    `lower` and `upper` are their extremes.  With too few evaluations to
-    choose from, nothing is identifiable.  This measures the search as much as
-    the trials: it says what this calibration knows, not what the trials could tell.
+    evaluations; the others scatter.  `std` is the root mean square distance of
+    the best 5 % (8 at least) from the (d,) point `best`; `lower` and `upper` are
+    their extremes.  With too few evaluations, no parameter is identifiable.  The
+    spread depends on the search as much as on the trials.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
     count = good_count(len(evaluations))
@@ -134,63 +128,62 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     return Uncertainty(std, points.min(axis=0), points.max(axis=0), everywhere, ~everywhere)
 
 
-def unknown(dimension: int) -> Floats:
-    """Return the (d, d) information on d parameters that may have any value of their scale."""
+def prior_information(dimension: int) -> Floats:
+    """Return the (d, d) information of the prior: d parameters may have any value of their scale."""
     return np.asarray(np.eye(dimension) / UNKNOWN_STD**2)
 
 
 def noise_alone(residual: float, noise: float) -> bool:
-    """Tell whether residuals are noise alone, by their standard deviation and the noise's [m]; nan: no."""
+    """Tell whether noise alone explains residuals, from both standard deviations [m]; nan: no."""
     return residual < MODEL_ERROR * noise
 
 
 def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = float('nan'),
                shift: Floats | None = None, starts: Sequence[Floats] = ()) -> Uncertainty:
     """
-    Return what the residuals and their derivatives at a minimum say.
+    Return the uncertainty that follows from the linearised residuals at a minimum.
 
-    :param noise: standard deviation of one coordinate of the observations [m]; nan where not known.
-    :param shift: (d,) how far a finer simulation moves the optimum; None: not known.
-    :param starts: (m,) [m] each, residuals there with other draws of the noise of the initial chains; may be
-        none.
+    :param noise: noise level: standard deviation of one measured coordinate [m]; nan if unknown.
+    :param shift: (d,) how far a finer simulation moves the optimum; None: unknown.
+    :param starts: residuals (m,) [m] at the minimum, for initial chains with other noise; may be empty.
     """
     point, loss = fit.point, Huber.of(fit.residuals)
     clipped = loss.clipped(fit.residuals)
     residual = loss.deviation(fit.residuals, len(point))
-    scale = residual * float(np.sqrt(independence(clipped, layout)))
+    scale = residual * float(np.sqrt(correlation_length(clipped, layout)))
     weighted = fit.weighted(loss.roots(fit.residuals) / scale)
-    prior = unknown(len(point))
+    prior = prior_information(len(point))
     with np.errstate(divide='ignore'):
         excited = 1 / np.sqrt(np.diag(weighted.information)) < UNKNOWN_STD
     covariance = np.linalg.inv(weighted.information + prior)
     extra = np.zeros(len(point))
-    if len(layout.shapes) >= FEWEST_TRIALS and not noise_alone(residual, noise):
+    if len(layout.shapes) >= 3 and not noise_alone(residual, noise):  # two say too little of a variance
         disagreement = np.maximum(
-            np.var(left_out(weighted, layout.rows, prior), axis=0) * (len(layout.shapes) - 1),
-            np.var(drawn_again(weighted, layout.rows, prior), axis=0))
+            np.var(jackknife(weighted, layout.rows, prior), axis=0) * (len(layout.shapes) - 1),
+            np.var(bootstrap(weighted, layout.rows, prior), axis=0))
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
-        extra = extra + (REMAINING * shift)**2
+        extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
         pulls = [fit.jacobian[rows].T @ (loss.clipped(one) - clipped)[rows]
                  for one in starts for rows in layout.rows]
         moves = covariance @ np.array(pulls).T / scale**2
         covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0) / len(starts)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
-    # None is known worse than a value that may be anything.
+    # No standard deviation is larger than that of the prior.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
     covariance = covariance * np.outer(shrink, shrink)
     std = np.where(excited, np.sqrt(np.diag(covariance)), UNKNOWN_STD)
     lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
     upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
-    at_bound = excited & ((point < AT_BOUND) | (point > 1 - AT_BOUND))
+    at_bound = excited & ((point < 0.002) | (point > 0.998))
     return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited, at_bound,
                        frozen_array(covariance), residual, scale)
 
 
-def left_out(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Floats:
+def jackknife(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Floats:
     """
-    Return (T, d): how far the optimum moves when one group of residuals after the other is left out.
+    Return (T, d): how far the optimum moves when each group of residuals in turn is left out.
 
     One Gauss-Newton step from the common optimum (the jackknife of Efron and
     Tibshirani, An Introduction to the Bootstrap, 1993, 11, linearised).
@@ -206,12 +199,12 @@ def left_out(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Floa
     return np.array(moved)
 
 
-def drawn_again(fit: Linearisation, groups: Sequence[slice], prior: Floats, draws: int = 200) -> Floats:
+def bootstrap(fit: Linearisation, groups: Sequence[slice], prior: Floats, draws: int = 200) -> Floats:
     """
-    Return (draws, d): how far the optimum moves where as many of the T trials are drawn, with replacement.
+    Return (draws, d): how far the optimum moves when T trials are drawn from the T trials with replacement.
 
-    The bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 6), each by one
-    Gauss-Newton step from the common optimum; the same draws each time.
+    One Gauss-Newton step from the common optimum for each draw (Efron and Tibshirani, An Introduction to
+    the Bootstrap, 1993, 6); every call makes the same draws.
 
     :param groups: the rows of T trials.
     :param prior: (d, d) added to the information.
@@ -225,13 +218,13 @@ def drawn_again(fit: Linearisation, groups: Sequence[slice], prior: Floats, draw
     return moved
 
 
-def independence(residuals: Floats, layout: ResidualLayout) -> float:
+def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:
     """
-    Return how many residuals count as one, >= 1: neighbours along the DLO and in time err alike.
+    Return how many neighbouring residuals count as one, >= 1: along the DLO and in time, they are correlated.
 
-    The product of the integrated autocorrelation lengths, 1 + 2 sum rho_k (Priestley,
-    Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial,
-    each summed up to the first that white noise could show.
+    This is the product of the integrated autocorrelation lengths, 1 + 2 sum rho_k (Priestley,
+    Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial.
+    Each sum ends before the first rho_k that white noise could have.
     """
     blocks = layout.chains(residuals)
     power = float(np.mean([np.square(block).mean() for block in blocks]))
@@ -252,14 +245,14 @@ def independence(residuals: Floats, layout: ResidualLayout) -> float:
 
 def optimum_shift(fit: Linearisation, finer: Floats) -> Floats:
     """
-    Return (d,): how far the optimum moves where a finer simulation gives residuals `finer`, (m,) [m].
+    Return (d,): how far the optimum moves if a finer simulation gives the residuals `finer`, (m,) [m].
 
-    A Gauss-Newton step on the difference, each parameter no further than its whole scale.
+    This is a Gauss-Newton step on the difference; no parameter moves further than its whole scale.
     """
     return np.clip(replace(fit, residuals=finer - fit.residuals).step(fit.ridge), -1.0, 1.0)
 
 
 def predictive_std(jacobian: Floats, covariance: Floats) -> Floats:
-    """Return (p,) [m]: how far each of p simulated points may lie elsewhere, given the covariance (d, d)."""
+    """Return (p,) standard deviations of p simulated points [m], from the covariance (d, d)."""
     variances = np.einsum('mi,ij,mj->m', jacobian, covariance, jacobian)
     return np.asarray(np.sqrt(variances.reshape(-1, 3).sum(axis=1)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.missing_parameters import PARTS
-from dlo_calibration.inference.trial_information import silent
+from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME, PER_WEIGHT, SCALE
 from dlo_calibration.model.quantity import interval, measured, number
@@ -58,7 +58,7 @@ def _open(result: CalibrationResult) -> list[str]:
 
 
 def _silent(result: CalibrationResult) -> list[str]:
-    names = silent(result.trials, result.examination) if len(result.trials) > 1 else ()
+    names = uninformative(result.trials, result.examination) if len(result.trials) > 1 else ()
     return [f'{", ".join(names)} told nothing: the parameters would be known as well without.'] * bool(names)
 
 

@@ -42,7 +42,7 @@ def appraiser():
 def test_each_trial_is_appraised_once_after_those_before_it(appraiser):
     first, second = appraised(appraiser, TRIALS[:2])
     assert (first.trial, second.trial) == ('trial 1', 'trial 2')
-    assert first.told == ('flexibility', 'friction')
+    assert first.improved == ('flexibility', 'friction')
     assert second.before.tolist() == first.after.tolist()
     assert appraised(appraiser, TRIALS[:2]) == []
     third, = appraised(appraiser, TRIALS)
@@ -99,7 +99,7 @@ def test_an_engine_that_cannot_be_had_gives_a_sentence():
         raise DloCalibrationError('no such engine')
 
     told, = appraised(LiveInformation(refuse), TRIALS[:2])
-    assert told.words == 'what trial 2 tells is not known: no such engine'
+    assert told.words == 'the information of trial 2 is unknown: no such engine'
 
 
 def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():

@@ -14,7 +14,7 @@ from toy_simulator import new_toy, ToySimulator
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.inference.slices import cut, LEVELS, NARROWEST, pairs, seconds_for
+from dlo_calibration.inference.slices import LEVELS, NARROWEST, pairs, seconds_for, simulate_slices
 
 
 @pytest.fixture(scope='module')
@@ -28,7 +28,7 @@ def result():
 def around(result, simulator=None, seconds=60.0, **rest):
     """Return slices around a result."""
     evaluator = Evaluator(result.trials, result.space, simulator or ToySimulator())
-    return cut(evaluator, result.best, result.std, result.examination, seconds=seconds, **rest)
+    return simulate_slices(evaluator, result.best, result.std, result.examination, seconds=seconds, **rest)
 
 
 def test_a_line_per_parameter_whose_lowest_error_is_at_the_truth(result):

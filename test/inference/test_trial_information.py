@@ -12,12 +12,12 @@ from toy_simulator import REACH, toy_trial, ToySimulator
 
 from dlo_calibration import Chain, Goal, Hand, SimulationError
 from dlo_calibration.inference.trial_information import (
-    glimpse,
-    knowledge,
-    silent,
+    posterior,
     simulated_information,
-    told_by,
+    std_of_each_alone,
     TrialInformation,
+    uninformative,
+    without_repeated_goals,
 )
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.parameters import ParameterSpace
@@ -45,7 +45,7 @@ class Blind(ToySimulator):
 
 def told(trials, simulator):
     """Return what each trial adds to those before."""
-    known, found = knowledge(trials, SPACE, 0.0), []
+    known, found = posterior(trials, SPACE, 0.0), []
     for trial in trials:
         after = known.after(simulated_information(trial, known, SPACE, simulator, 1.0, 0.0))
         found.append(TrialInformation(trial.name, known.names, known.std, after.std))
@@ -54,13 +54,13 @@ def told(trials, simulator):
 
 
 def test_before_any_trial_nothing_is_known():
-    known = knowledge([FIRST], SPACE, 0.0)
+    known = posterior([FIRST], SPACE, 0.0)
     assert known.std == pytest.approx([UNKNOWN_STD] * 2)
     assert ((known.point >= 0) & (known.point <= 1)).all()
 
 
 def test_the_standard_deviation_after_a_trial_is_that_of_linear_regression():
-    known = knowledge([FIRST], SPACE, 0.0)
+    known = posterior([FIRST], SPACE, 0.0)
     after = known.after(simulated_information(FIRST, known, SPACE, ToySimulator(), 1.0, 0.0))
     assert after.std == pytest.approx((12 + SQUARES / known.scale**2)**-0.5, rel=1e-6)
 
@@ -69,18 +69,18 @@ def test_rougher_chains_tell_less():
     smooth = toy_trial(TRUTH, n=41)
     rough = smooth.goals[0].chain.points + np.random.default_rng(1).normal(0, 5e-3, (41, 3))
     noisy = replace(smooth, goals=(Goal(Chain(rough), 2.0),))
-    assert knowledge([noisy], SPACE, 0.0).scale > 2 * knowledge([smooth], SPACE, 0.0).scale
+    assert posterior([noisy], SPACE, 0.0).scale > 2 * posterior([smooth], SPACE, 0.0).scale
 
 
 def test_a_trial_tells_what_it_shows_and_a_repeat_nothing_new():
     trials = [FIRST, replace(FIRST, name='trial 2'), replace(FIRST, name='trial 2')]
     first, second, third = told(trials, Blind())
-    assert first.told == ('flexibility',)
-    assert second.told == ('friction',)
-    assert third.told == ()
+    assert first.improved == ('flexibility',)
+    assert second.improved == ('friction',)
+    assert third.improved == ()
     assert first.after[1] == pytest.approx(UNKNOWN_STD)
-    assert first.words.startswith('trial 1 tells flexibility (± 28.9 -> ± ')
-    assert first.words.endswith(' of 100); nothing new about friction')
+    assert first.words.startswith('trial 1 makes flexibility more certain (± 28.9 -> ± ')
+    assert first.words.endswith(' of 100); it adds nothing about friction')
     assert third.words == 'trial 2 adds nothing new: repeat it only to average noise'
     assert second.values['std_before_friction'] == pytest.approx(100 * UNKNOWN_STD)
     assert second.values['std_after_friction'] < 5
@@ -93,7 +93,7 @@ def test_what_a_trial_surely_does_not_show_is_not_simulated():
     simulator = ToySimulator()
     simulate = simulator.simulate
     simulator.simulate = lambda trial, physical: simulated.append(physical) or simulate(trial, physical)
-    known = knowledge([FIRST], space, 0.0)
+    known = posterior([FIRST], space, 0.0)
     after = known.after(simulated_information(FIRST, known, space, simulator, 1.0, 0.0))
     assert len(simulated) == 2  # either side in flexibility; damping does not show at rest
     assert after.std[1] == pytest.approx(UNKNOWN_STD)
@@ -108,20 +108,20 @@ class Restless(ToySimulator):
 
 
 def test_a_trial_that_does_not_come_to_rest_tells_what_it_tells():
-    known = knowledge([FIRST], SPACE, 0.0)
+    known = posterior([FIRST], SPACE, 0.0)
     one, other = (simulated_information(FIRST, known, SPACE, toy, 1.0, 0.0)
                   for toy in (Restless(), ToySimulator()))
     assert one.tolist() == other.tolist()
 
 
 def test_a_trial_that_cannot_be_simulated_says_so():
-    known = knowledge([FIRST], SPACE, 0.0)
+    known = posterior([FIRST], SPACE, 0.0)
     with pytest.raises(SimulationError, match='diverged'):
         simulated_information(FIRST, known, SPACE, ToySimulator(fail_below=101.0), 1.0, 0.0)
     told = TrialInformation.unknown('trial 3', SPACE.free, 'it diverged')
-    assert told.words == 'what trial 3 tells is not known: it diverged'
+    assert told.words == 'the information of trial 3 is unknown: it diverged'
     assert told.values == {}
-    assert told.told == ()
+    assert told.improved == ()
 
 
 def stream(count):
@@ -133,11 +133,11 @@ def stream(count):
 
 
 def test_a_tracker_that_goes_on_at_rest_changes_nothing():
-    known = knowledge([FIRST], SPACE, 0.0)
+    known = posterior([FIRST], SPACE, 0.0)
     short, long = (simulated_information(stream(count), known, SPACE, ToySimulator(), 1.0, 0.0)
                    for count in (1, 100))
     assert short.tolist() == long.tolist()
-    assert [goal.stable for goal in glimpse(stream(100)).goals] == [False] * 5 + [True]
+    assert [goal.stable for goal in without_repeated_goals(stream(100)).goals] == [False] * 5 + [True]
 
 
 def test_each_rest_counts():
@@ -145,7 +145,7 @@ def test_each_rest_counts():
     chain = FIRST.goals[0].chain
     twice = replace(FIRST, actions=(*FIRST.actions, type(FIRST.actions[0])((hand,))),
                     goals=(Goal(chain, 2.0), Goal(chain, 3.0), Goal(chain, 6.0), Goal(chain, 7.0)))
-    assert [goal.time for goal in glimpse(twice).goals] == [2.0, 6.0]
+    assert [goal.time for goal in without_repeated_goals(twice).goals] == [2.0, 6.0]
 
 
 def noisy_trial(name, seed):
@@ -164,21 +164,21 @@ def test_after_a_result_the_next_trial_adds_to_what_it_found():
     # Four: what is known counts the noise of their initial chains, too, which the toy does not smooth.
     result = calibrated(ToySimulator(), 'trial 1', 'trial 2', 'trial 3', 'trial 4')
     assert result.examination.regular
-    known = knowledge(result.trials, SPACE, 0.0, result.best.point, result.examination)
+    known = posterior(result.trials, SPACE, 0.0, result.best.point, result.examination)
     assert known.point.tolist() == result.best.point.tolist()
     assert known.std == pytest.approx(result.examination.uncertainty.std, rel=1e-6)
     again = TrialInformation('trial 5', known.names, known.std, known.after(simulated_information(
         FIRST, known, SPACE, ToySimulator(), 1.0, 0.0)).std)
-    assert again.told == ()
+    assert again.improved == ()
 
 
 def test_a_result_says_what_each_trial_told_alone():
     result = calibrated(Blind(), 'trial 1', 'trial 2')
-    alone = told_by(result.trials, result.examination)
+    alone = std_of_each_alone(result.trials, result.examination)
     assert alone.shape == (2, 2)
     assert alone[0, 1] == pytest.approx(UNKNOWN_STD)
     assert (alone[[0, 1, 1], [0, 0, 1]] < 0.1).all()
-    assert silent(result.trials, result.examination) == ()
+    assert uninformative(result.trials, result.examination) == ()
 
 
 def test_a_trial_that_told_nothing_is_named():
@@ -189,5 +189,5 @@ def test_a_trial_that_told_nothing_is_named():
             return super().simulate(trial, physical)
 
     result = calibrated(Deaf(), 'trial 1', 'idle', 'trial 3')
-    assert silent(result.trials, result.examination) == ('idle',)
-    assert silent(result.trials, None) == ()
+    assert uninformative(result.trials, result.examination) == ('idle',)
+    assert uninformative(result.trials, None) == ()

@@ -12,9 +12,9 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
-    drawn_again,
-    independence,
-    left_out,
+    bootstrap,
+    correlation_length,
+    jackknife,
     optimum_shift,
     predictive_std,
     spread_of_best,
@@ -155,7 +155,7 @@ def test_leaving_a_trial_out_moves_the_optimum_as_a_new_fit_would():
     at = LAYOUT.rows[0].stop
     again, _ = fitted(jacobian[at:], errors[at:])
     fit = Linearisation(POINT, residuals, jacobian)
-    assert left_out(fit, LAYOUT.rows, fit.ridge)[0] == pytest.approx(again - moved, abs=1e-6)
+    assert jackknife(fit, LAYOUT.rows, fit.ridge)[0] == pytest.approx(again - moved, abs=1e-6)
 
 
 def test_trials_drawn_again_scatter_as_their_mean_does():
@@ -165,7 +165,7 @@ def test_trials_drawn_again_scatter_as_their_mean_does():
     values -= values.mean()
     jacobian = np.ones((30 * count, 1))
     fit = Linearisation(np.zeros(1), np.repeat(-values, 30), jacobian)
-    moved = drawn_again(fit, ResidualLayout(((2, 5),) * count).rows, np.zeros((1, 1)), draws=4000)
+    moved = bootstrap(fit, ResidualLayout(((2, 5),) * count).rows, np.zeros((1, 1)), draws=4000)
     assert moved.shape == (4000, 1)
     assert moved.std() == pytest.approx(values.std() / np.sqrt(count), rel=0.05)
     assert moved.mean() == pytest.approx(0, abs=3e-4)
@@ -256,11 +256,11 @@ def test_outliers_hardly_widen_the_intervals():
 def test_white_residuals_count_each_and_smooth_ones_do_not():
     generator = np.random.default_rng(8)
     white = generator.normal(size=3 * 10 * 50)
-    assert independence(white, ResidualLayout(((10, 50),))) < 1.3
+    assert correlation_length(white, ResidualLayout(((10, 50),))) < 1.3
     alike = np.repeat(generator.normal(size=(10, 10, 1, 3)), 5, axis=2)  # five neighbours each
-    assert 3 < independence(alike.ravel(), ResidualLayout(((10, 50),))) < 8
+    assert 3 < correlation_length(alike.ravel(), ResidualLayout(((10, 50),))) < 8
     in_time = np.repeat(generator.normal(size=(2, 1, 50, 3)), 5, axis=1)
-    assert independence(in_time.ravel(), ResidualLayout(((10, 50),))) > 3
+    assert correlation_length(in_time.ravel(), ResidualLayout(((10, 50),))) > 3
 
 
 def test_the_band_of_a_chain_follows_from_the_covariance():

@@ -117,7 +117,7 @@ def test_status_tells_what_the_newest_trial_tells(types):
     failed, values = by_name(diagnostics.status(
         types, stamp=STAMP, state='failed', trials=2, detail='why',
         information=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
-    assert values['last_trial'] == 'what trial 2 tells is not known: it diverged'
+    assert values['last_trial'] == 'the information of trial 2 is unknown: it diverged'
     assert not any(key.startswith('std_') for key in values)
     assert failed.message == 'failed: why'
 

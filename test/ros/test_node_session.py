@@ -344,7 +344,7 @@ def test_status_says_whether_a_trial_added_information(start, tmp_path, command)
     graph.send(session_messages(TYPES, 1))
     graph.ahead += 1.0
     graph.until(lambda: graph.status['last_trial'])
-    assert graph.status['last_trial'].startswith('trial 1 tells flexibility (')
+    assert graph.status['last_trial'].startswith('trial 1 makes flexibility more certain (')
     assert graph.heard['status'][-1].status[0].message.endswith(graph.status['last_trial'])
     assert float(graph.status['std_after_flexibility']) < 0.5 * float(graph.status['std_before_flexibility'])
     graph.send(trial_messages(TYPES, toy_trials(1)[0], 2 * MINUTE))  # the same again
