@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""calibrate(): the way from trials to a parameter set, stage by stage."""
+"""calibrate(): from trials to a parameter set, stage by stage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.parts import FIRST_SHARE, fit_parts
+from dlo_calibration.calibration.parts import fit_parts
 from dlo_calibration.calibration.prior import Prior, prior
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
@@ -37,20 +37,20 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
               make_simulator: SimulatorFactory = make_chosen_simulator,
               clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
     """
-    Find the parameter set with which a simulator moves the DLO as the trials show, and how sure it is.
+    Find the parameter set whose simulation fits the trials best, and how certain each parameter is.
 
-    The stages are named in the code below, in their order. The same trials, options and seed give the
-    same result, bit for bit, for any number of processes; the node and the command line come here, too.
+    The code below names the stages in their order. The same trials, options and seed give the same result,
+    bit for bit, for any number of processes. The node and the command line call this function, too.
 
     :param options: see `Options`; None: the defaults.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
-    :param on_notice: called at once, from any thread, with a sentence about what went wrong and was mended,
-        such as a process that died; `CalibrationResult.warnings` has it, too.
-    :param should_stop: asked often; once True, every stage ends, and what was found so far is the result.
-    :param make_simulator: makes the engine that `options` ask for; called in this thread.
-    :param clock: [s], for `CalibrationResult.seconds`.
-    :raises InputError: where there is nothing to calibrate on, or an option cannot be satisfied.
-    :raises SimulationError: where no evaluation could be simulated.
+    :param on_notice: called immediately, from any thread, with a sentence about a failure that did not end
+        the calibration, such as a process that died; `CalibrationResult.warnings` contains it, too.
+    :param should_stop: asked often; once True, every stage ends, and the result is the best so far.
+    :param make_simulator: makes the engine that `options` name; called in this thread.
+    :param clock: the time [s], for `CalibrationResult.seconds`.
+    :raises InputError: if there is no trial, or an option cannot be satisfied.
+    :raises SimulationError: if no evaluation could be simulated.
     """
     if not trials:
         raise InputError('calibration', 'no trials', 'at least one complete trial',
@@ -63,7 +63,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         on_notice(text)
 
     with ExitStack() as stack:
-        executor = _executor(options, notice, on_notice)  # its processes start while the engine is made
+        executor = _executor(options, notice, on_notice)  # its processes start while the engine is being made
         if executor is not None:
             stack.callback(executor.close)
         simulator = stack.enter_context(closing(make_simulator(options)))
@@ -74,15 +74,15 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
     result = confirmed(result, options, make_simulator, should_stop)
-    told = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
-    return replace(result, warnings=(*result.warnings, *told), seconds=clock() - begun)
+    noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
+    return replace(result, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
 
 
 def fitted(setting: Setting) -> CalibrationResult:
     """
-    Search and examine what was found: the stages without which there is no result.
+    Search, and examine the best parameter set: the stages that every result needs.
 
-    :raises SimulationError: where no evaluation could be simulated.
+    :raises SimulationError: if no evaluation could be simulated.
     """
     known = prior(setting.trials, setting.options)
     found = searched(setting, known)
@@ -92,21 +92,22 @@ def fitted(setting: Setting) -> CalibrationResult:
 
 def searched(setting: Setting, known: Prior) -> Fit:
     """
-    Let the search that the options name find the best parameter set, and as many parts as the trials support.
+    Find the best parameter set with the chosen search, and the number of parts if that is open.
 
-    :raises SimulationError: where no evaluation could be simulated.
+    :raises SimulationError: if no evaluation could be simulated.
     """
     options = setting.options
     search = SEARCHES[options.search](known.space.dimension, options.seed, known.hints)
     if not setting.chooses_parts:
         return fit(setting, known.space, search, options.evaluations)
-    even = fit(setting, known.space, search, max(1, math.ceil(FIRST_SHARE * options.evaluations)))
-    return fit_parts(setting, even, options.evaluations)
+    # The uniform DLO gets 40 % of the budget, so that enough is left for several parts.
+    uniform = fit(setting, known.space, search, max(1, math.ceil(0.4 * options.evaluations)))
+    return fit_parts(setting, uniform, options.evaluations)
 
 
 def _executor(options: Options, on_death: Callable[[str], None],
               on_wait: Callable[[str], None]) -> ProcessExecutor | ClusterExecutor | None:
-    """Return where evaluations are simulated; None: here."""
+    """Return the executor that simulates evaluations; None: this thread does."""
     if options.scheduler:
         return ClusterExecutor(options.scheduler, on_death, on_wait)
     workers = min(options.workers or cores(), options.evaluations)

@@ -15,8 +15,6 @@ from dlo_calibration.simulation.protocol import Simulator
 
 SimulatorFactory = Callable[[Options], Simulator]
 
-LOG = logging.getLogger('dlo_calibration.calibration.engines')
-
 
 def _bullet(options: Options) -> Simulator:
     from dlo_calibration.simulation.bullet import BulletSimulator
@@ -26,7 +24,7 @@ def _bullet(options: Options) -> Simulator:
 
 def _compiled(options: Options) -> Simulator:
     if options.scene:
-        raise InputError('engine compiled', f'scene {options.scene}', 'no scene, for it knows only a table',
+        raise InputError('engine compiled', f'scene {options.scene}', 'no scene: it simulates only a table',
                          'use engine bullet or auto')
     from dlo_calibration.simulation.compiled import CompiledSimulator
 
@@ -34,28 +32,28 @@ def _compiled(options: Options) -> Simulator:
 
 
 def _auto(options: Options) -> Simulator:
-    """Return the compiled engine where there is no scene, else Bullet, which is told once."""
+    """Return the compiled engine, or Bullet with a warning if there is a scene."""
     if options.scene:
-        _tell('rounds are simulated by PyBullet, about 30 times slower, because engine compiled knows no '
-              f'scene: {options.scene}')
+        _warn_once('PyBullet simulates the evaluations, about 30 times slower, because engine compiled does '
+                   f'not support a scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)
 
 
 def _settings(options: Options) -> dict[str, Any]:
-    """Return what every engine is built with."""
+    """Return the constructor arguments that all engines share."""
     return {'table': options.table, 'table_height': options.table_height, 'nodes': options.nodes,
             'time_step': options.time_step, 'stable_distance': options.stable_distance,
             'stable_time': options.stable_time, 'settle_limit': options.settle_limit}
 
 
 @functools.cache
-def _tell(notice: str) -> None:
-    """Log a notice, once per process."""
-    LOG.warning(notice)
+def _warn_once(text: str) -> None:
+    """Log a warning, once per process."""
+    logging.getLogger(__name__).warning(text)
 
 
-#: name -> constructor; each imports its engine only when it is called
+#: name -> constructor, which imports its engine only when called
 ENGINES: Mapping[str, Callable[[Options], Simulator]] = {
     AUTO: _auto,
     'bullet': _bullet,
@@ -65,8 +63,8 @@ ENGINES: Mapping[str, Callable[[Options], Simulator]] = {
 
 def make_simulator(options: Options) -> Simulator:
     """
-    Return the simulator that `options` ask for.
+    Return the simulator that `options` name.
 
-    :raises InputError: where it cannot be had, or cannot represent the scene.
+    :raises InputError: if the engine is not available, or cannot represent the scene.
     """
     return ENGINES[options.engine](options)

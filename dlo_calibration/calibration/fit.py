@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The fit: a search within its budget, and the evaluation that it ends with."""
+"""The fit: a search within its budget, and the best evaluation."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from dlo_calibration.search import Observation, Search
 @dataclass(frozen=True)
 class Fit:
     """
-    Where a search has ended.
+    The outcome of a search.
 
-    :param search: its name.
-    :param best: the evaluation that the search calls the best.
-    :param evaluations: all of them, without residuals.
-    :param ended: why it ended, in words.
-    :param stopped: whether somebody asked to stop.
-    :param examination: of the surroundings of the best; None where there was no time for it.
-    :param parts: how the number of parts was chosen, in words; empty where it was given.
+    :param space: the parameters that were searched.
+    :param search: name of the search.
+    :param best: the best evaluation by the measure of the search.
+    :param evaluations: all evaluations, without residuals.
+    :param ended: why the search ended, in words.
+    :param stopped: whether the user stopped it.
+    :param examination: of the surroundings of the best evaluation; None if the user stopped before.
+    :param parts: how the number of parts was chosen, in words; empty if it was given.
     """
 
     space: ParameterSpace
@@ -47,19 +48,20 @@ class Fit:
 
     @property
     def examined(self) -> int:
-        """How many parameter sets were simulated around the best; 0 where there was no time for it."""
+        """Number of parameter sets simulated for the examination; 0 without one."""
         return 0 if self.examination is None else self.examination.evaluations
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
     """
-    Let a search evaluate parameter sets until it has finished, its budget is spent, or it is stopped.
+    Evaluate the parameter sets that a search asks for, until it ends, its budget is spent, or it is stopped.
 
-    The outcome does not depend on where evaluations are simulated: the search is told in the order asked.
+    The outcome does not depend on the number of processes: the search receives evaluations in the order in
+    which it asked for them.
 
-    :param budget: number of evaluations.
-    :param first: index of the first of them.
-    :raises SimulationError: where no evaluation could be simulated.
+    :param budget: largest number of evaluations.
+    :param first: index of the first evaluation.
+    :raises SimulationError: if no evaluation could be simulated.
     """
     evaluate = setting.evaluate(space)
     kept: list[Evaluation] = []
@@ -86,7 +88,7 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
 
 
 def _better(best: Evaluation | None, batch: list[Evaluation], search: Search) -> Evaluation | None:
-    """Return the evaluation that the search calls the best; while there is none, that of lowest score."""
+    """Return the best evaluation by the measure of the search; until there is one, that of lowest score."""
     chosen = search.best
     for one in batch:
         if best is None or best.residuals is None and one.score < best.score or (

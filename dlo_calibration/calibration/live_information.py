@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-LiveInformation: what each trial tells, found out beside whoever asks, before anything is calibrated.
+LiveInformation: how much each new trial adds, computed in the background before a calibration.
 
-It simulates in a process of its own: PyBullet and the import of Numba hold
-the interpreter's lock, and a process can be ended at once, in the middle of a
-simulation, when a calibration begins or the trials are forgotten.
+It simulates in a process of its own, because PyBullet and the import of Numba hold
+the interpreter's lock, and because a process can be ended in the middle of a
+simulation when a calibration begins or the trials are deleted.
 """
 
 from __future__ import annotations
@@ -37,14 +37,12 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Simulator
 
-LOOK = 0.05  # s between two looks at whether to stop
-
-#: fingerprint -> (d, d) information of a trial, or in words why there is none
+#: fingerprint -> (d, d) information of a trial, or why there is none, in words
 _Known = dict[tuple[bytes, int], Union[Floats, str]]
 
 
 class _Job:
-    """One appraisal: what it found so far, and whether it is to stop."""
+    """One appraisal: its results so far, and a request to stop."""
 
     def __init__(self, found: queue.SimpleQueue[TrialInformation],
                  thread: threading.Thread | None = None) -> None:
@@ -55,31 +53,33 @@ class _Job:
 
 class LiveInformation:
     """
-    Appraises trials in a thread, one session after the other.
+    Appraises trials in a thread: it computes the information that each of them adds.
 
-    A trial is simulated once, unless it changes, or the options, or the last result do.
+    A trial is simulated again only after the trial, the options or the last result have changed.
 
-    :param make_simulator: called in the thread.
+    :param make_simulator: makes the engine; called in the thread.
     """
 
     def __init__(self, make_simulator: SimulatorFactory) -> None:
         self._make_simulator = make_simulator
         self._job = _Job(queue.SimpleQueue())
-        self._base: tuple[str, CalibrationResult | None] | None = None  # options and result of `_known`
+        # `_known` is valid for these options and this result
+        self._base: tuple[str, CalibrationResult | None] | None = None
         self._known: _Known = {}
 
     @property
     def alive(self) -> bool:
-        """Tell whether an appraisal is under way; some of it may be waiting when it is not."""
+        """Tell whether an appraisal is under way; afterwards, results may still be waiting."""
         return self._job.thread is not None and self._job.thread.is_alive()
 
     def start(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None = None,
               whole: bool = True) -> None:
         """
-        Begin to appraise the trials that were not yet; returns at once.
+        Begin to appraise the trials that are new, and return immediately.
 
-        :param result: of the last calibration; its trials are known, those of other parameters do not count.
-        :param whole: False where more of the last trial is to come; it then waits for a goal at rest.
+        :param result: of the last calibration, whose trials are not appraised again; it is ignored if it has
+            other parameters.
+        :param whole: False while the last trial is incomplete: it is then left out unless it ends at rest.
         :raises DloCalibrationError: while another appraisal is under way.
         """
         if self.alive:
@@ -98,7 +98,7 @@ class LiveInformation:
         self._job.thread.start()
 
     def stop(self) -> None:
-        """End the appraisal under way, and forget what was found so far; returns at once."""
+        """End the appraisal under way, delete its results, and return immediately."""
         self._job.stop.set()
         self._job, self._base = _Job(queue.SimpleQueue(), self._job.thread), None
 
@@ -109,7 +109,7 @@ class LiveInformation:
         return not self.alive
 
     def waiting_information(self) -> Iterator[TrialInformation]:
-        """Take what was found, without waiting for more."""
+        """Yield the results so far, without waiting for more."""
         while True:
             try:
                 yield self._job.found.get_nowait()
@@ -122,7 +122,7 @@ class LiveInformation:
             self._appraise(job, trials, options, result, known)
         except CancelledError:
             pass
-        except Exception as error:  # whatever it is, nobody else need care
+        except Exception as error:  # an appraisal never disturbs the node
             job.found.put(TrialInformation.unknown(trials[-1].name, options.space.free, _one_line(error)))
 
     def _appraise(self, job: _Job, trials: Sequence[Trial], options: Options,
@@ -145,34 +145,34 @@ class LiveInformation:
                             _simulated, trial, known, space, simulator, length, height))
                     except CancelledError:
                         raise
-                    except Exception as error:  # of any kind: of an engine, or of a process that died
+                    except Exception as error:  # of the engine, or because the process died
                         informations[key] = _one_line(error)
                 found = informations[key]
                 if isinstance(found, str):
-                    told = TrialInformation.unknown(trial.name, known.names, found)
+                    added = TrialInformation.unknown(trial.name, known.names, found)
                 else:
                     after = known.after(found)
-                    told, known = TrialInformation(trial.name, known.names, known.std, after.std), after
+                    added, known = TrialInformation(trial.name, known.names, known.std, after.std), after
                 if fresh:
-                    job.found.put(told)
+                    job.found.put(added)
 
 
 def _simulated(trial: Trial, known: Posterior, space: ParameterSpace, simulator: Simulator, length: float,
                table_height: float | None) -> Floats:
-    """Return the information of a trial; the work of a process."""
+    """Return the (d, d) information of a trial; called in the process."""
     with closing(simulator):
         return simulated_information(trial, known, space, simulator, length, table_height)
 
 
 def _result(job: _Job, future: Future[Any]) -> Any:
     """
-    Return the result of a future.
+    Wait for the result of a future.
 
-    :raises CancelledError: as soon as the job is to stop.
+    :raises CancelledError: as soon as the job is asked to stop.
     """
     while not job.stop.is_set():
         try:
-            return future.result(timeout=LOOK)
+            return future.result(timeout=0.05)
         except TimeoutError:
             if future.done():
                 raise
@@ -180,7 +180,7 @@ def _result(job: _Job, future: Future[Any]) -> Any:
 
 
 def _fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:
-    """Return what tells trials apart, whatever their names; of equal ones, each has its own number."""
+    """Return what distinguishes trials, apart from their names; equal ones are numbered."""
     seen: Counter[bytes] = Counter()
     found = []
     for trial in trials:
@@ -191,14 +191,14 @@ def _fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:
 
 
 def _fingerprint(trial: Trial) -> bytes:
-    """Return the start of a trial, its hands and its instants."""
-    seen = without_repeated_goals(trial)
-    pieces: list[Any] = [seen.initial.points.tobytes(), b'' if seen.velocity is None else
-                         seen.velocity.tobytes()]
-    for hand in seen.hands:
+    """Return the initial chain of a trial, its hands and the times of its goals, as bytes."""
+    trial = without_repeated_goals(trial)
+    pieces: list[Any] = [trial.initial.points.tobytes(),
+                         b'' if trial.velocity is None else trial.velocity.tobytes()]
+    for hand in trial.hands:
         pieces += [hand.name, hand.grips, hand.times.tobytes(), hand.positions.tobytes(),
                    hand.orientations.tobytes()]
-    pieces += [(goal.time, goal.stable, goal.held_by) for goal in seen.goals]
+    pieces += [(goal.time, goal.stable, goal.held_by) for goal in trial.goals]
     return repr(pieces).encode()
 
 

@@ -26,24 +26,21 @@ from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 
-PAPER_EVALUATIONS = 150  # the paper's rounds
-AUTO = 'auto'  # engine: the fastest one that can do it, and another one that confirms its result
+AUTO = 'auto'  # engine: the fastest one that supports the options; the confirming one checks its result
 CONFIRMING = 'bullet'
-ENGINES = (AUTO, CONFIRMING, 'compiled')
 
-#: What an option belongs to: how trials were observed, what is searched and how it is simulated, the machine.
+#: What an option describes: how trials were observed; what is searched and simulated; the user's machine.
 OBSERVATION, SEARCH, MACHINE = 'observation', 'search', 'machine'
 
 
 @dataclass(frozen=True)
 class Declaration:
     """
-    One option, as ROS and the command line need to know it.
+    One option, with all that ROS and the command line need to declare it.
 
-    :param default: its type is the option's type (bool, int, float, str, or a
-        tuple of str).
-    :param choices: the values that a str, or each of a tuple of str, may have.
-    :param of: OBSERVATION, SEARCH, or MACHINE, which has no effect on what is found.
+    :param default: also gives the type of the option: bool, int, float, str, or tuple of str.
+    :param choices: the permitted values of a str, or of each str of a tuple.
+    :param of: OBSERVATION, SEARCH, or MACHINE, which does not affect the result.
     """
 
     name: str
@@ -59,7 +56,7 @@ class Declaration:
         """
         Return `value` in the option's own type.
 
-        :raises InputError: where it has another type, or is out of range.
+        :raises InputError: if it has another type, or is out of range.
         """
         kind = type(self.default)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
@@ -92,10 +89,11 @@ def _option(default: Any, description: str, **rest: Any) -> Any:
 @dataclass(frozen=True)
 class Options:
     """
-    Everything that a user can set; see the declarations for meaning, unit and range.
+    Everything that a user can set; the declarations state meaning, unit and range.
 
     `values` holds the fixed value of every parameter except the mass, on the 0..100
-    scale. It is used if the parameter is not calibrated. Each is an option of its own.
+    scale; it is used if the parameter is not calibrated. Each is an option with the
+    name of the parameter.
     """
 
     mass: float = _option(
@@ -117,11 +115,12 @@ class Options:
     search: str = _option('least_squares', 'method that chooses the parameter sets to try',
                           choices=tuple(SEARCHES))
     evaluations: int = _option(
-        PAPER_EVALUATIONS, "largest number of parameter sets to try (the paper's rounds)", minimum=1,
+        150, "largest number of parameter sets to try (the paper's rounds)", minimum=1,
         maximum=1000000)
     seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
-    engine: str = _option(AUTO, 'simulation engine; auto: search with compiled and confirm the result with '
-                          'bullet, or use bullet alone if there is a scene', choices=ENGINES)
+    engine: str = _option(
+        AUTO, 'simulation engine; auto: search with compiled and confirm the result with bullet, or use '
+        'bullet alone if there is a scene', choices=(AUTO, CONFIRMING, 'compiled'))
     workers: int = _option(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
                            of=MACHINE)
     scheduler: str = _option(
@@ -163,7 +162,7 @@ class Options:
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
-        ParameterSpace(self.calibrate)  # refuses to find nothing, or something twice
+        ParameterSpace(self.calibrate)  # refuses an empty list and a name given twice
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Options:
@@ -187,7 +186,7 @@ class Options:
 
     @property
     def space(self) -> ParameterSpace:
-        """The parameters to find, and where the others stay."""
+        """The parameters to find, and the fixed values of the others."""
         parts = max(self.parts, ParameterSpace(self.calibrate).parts)
         return ParameterSpace(self.calibrate, self.values, self.mass).divided(parts)
 
@@ -203,11 +202,11 @@ FIXED_VALUES: Mapping[str, Declaration] = {
         f'{measured(p.at_hundred, p.unit)} (at 100), {"linear" if p.linear else "logarithmic"}; '
         'used if it is not calibrated',
         minimum=0.0, maximum=SCALE)
-    for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg of its own
+    for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg
 
 
 def declarations() -> Iterator[Declaration]:
-    """Declare every option, in the order to show them."""
+    """Yield the declaration of every option, in the order in which they are shown."""
     for option in fields(Options):
         if option.name != 'values':
             yield Declaration(option.name, option.default, **option.metadata)
@@ -215,5 +214,5 @@ def declarations() -> Iterator[Declaration]:
 
 
 def names_of(kind: str) -> tuple[str, ...]:
-    """List the options of the OBSERVATION, the SEARCH or the MACHINE."""
+    """Return the names of the options of a kind: OBSERVATION, SEARCH or MACHINE."""
     return tuple(declaration.name for declaration in declarations() if declaration.of == kind)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts: a DLO of as many parts, each with a bending stiffness of its own, as the trials support."""
+"""Parts: how many parts with different bending stiffness the trials support."""
 
 from __future__ import annotations
 
@@ -19,39 +19,32 @@ from dlo_calibration.model.chain import frozen_array
 from dlo_calibration.model.parameters import MOST_PARTS, ParameterSpace
 from dlo_calibration.search import Hints, LeastSquares
 
-FIRST_SHARE = 0.4  # of the budget, that may go into the DLO that is even
-FEWEST_LEFT = 3  # evaluations for each parameter, without which no more parts are tried
-EVEN_HALVES = 2  # parts that need not be better: what is stiff in the middle alone needs four to show it
-EXACT = 1e-6  # m; errors below it are none
-WORTHWHILE = 0.02  # share by which more parts lower the error of trials that are left out
 
-
-def fit_parts(setting: Setting, even: Fit, budget: int) -> Fit:
+def fit_parts(setting: Setting, uniform: Fit, budget: int) -> Fit:
     """
-    Cut every part in two as long as that predicts the trials better, beginning with an even DLO.
+    Halve all parts repeatedly while that improves the cross-validation error, beginning with a uniform DLO.
 
-    What must be predicted is each trial from the others (the cross-validation of the
-    examination; Stone, Cross-validatory choice, 1974), so that parts which only fit
-    noise are not kept. More parts begin where fewer ended, by least squares. All
-    evaluations count in the budget; `Fit.evaluations` has those of what was tried and
-    not kept, too.
+    Cross-validation predicts each trial from the others (Stone, Cross-validatory choice, 1974), so that
+    parts which only fit noise are rejected. The search for more parts is least squares, from the optimum of
+    fewer parts. All evaluations count in the budget, and `Fit.evaluations` contains those of rejected
+    numbers of parts, too.
 
-    :param even: what a search found of the even DLO.
-    :param budget: evaluations of all searches, `even` included.
+    :param uniform: the fit of the uniform DLO.
+    :param budget: largest number of evaluations of all searches, including those of `uniform`.
     """
-    best = latest = examined(setting, even, thorough=False)
+    best = latest = examined(setting, uniform, thorough=False)
     tried, why = [latest], ''
     while latest.examined and 2 * latest.space.parts <= MOST_PARTS:
         finer, start = latest.space.halved(latest.best.point)
         taken = sum(len(one.evaluations) for one in tried)
-        if budget - taken < FEWEST_LEFT * finer.dimension:
-            why = f'too few evaluations are left of the budget to try {finer.parts}'
+        if budget - taken < 3 * finer.dimension:  # one linearisation takes d + 1
+            why = f'the rest of the budget is too small to try {finer.parts}'
             break
         try:
             search = LeastSquares(finer.dimension, 0, Hints.at(start))
             found = fit(setting, finer, search, budget - taken, first=taken)
             latest = examined(setting, found, thorough=False)
-        except SimulationError:  # those before stand
+        except SimulationError:  # the fit of fewer parts remains valid
             why = f'{finer.parts} could not be simulated'
             break
         tried.append(latest)
@@ -61,7 +54,8 @@ def fit_parts(setting: Setting, even: Fit, budget: int) -> Fit:
             best, why = latest, ''
         else:
             why = f'{finer.parts} would not predict left-out trials better'
-            if finer.parts > EVEN_HALVES * even.space.parts:
+            # Two parts need not be better: a DLO that is stiff in the middle shows it only with four.
+            if finer.parts > 2 * uniform.space.parts:
                 break
     parts = best.space.parts
     examination = best.examination and replace(
@@ -73,7 +67,7 @@ def fit_parts(setting: Setting, even: Fit, budget: int) -> Fit:
 
 
 def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpace) -> Evaluation:
-    """Return an evaluation in another space: the same DLO where that has more parts, else what both name."""
+    """Return an evaluation in a space of other parts: the same DLO if it has more, else without the rest."""
     point = evaluation.point
     while tried.parts < space.parts:
         tried, point = tried.halved(point)
@@ -84,15 +78,15 @@ def _restated(evaluation: Evaluation, tried: ParameterSpace, space: ParameterSpa
 
 def _better(other: Fit, best: Fit) -> bool:
     """
-    Tell whether a fit predicts left-out trials better, by more than they differ in that.
+    Tell whether a fit predicts left-out trials better, by more than one standard error and 2 %.
 
-    That is the rule of one standard error (Breiman et al., Classification and Regression
-    Trees, 1984, 3.4.3), for the logarithm of the error: a trial that is hard to predict counts as one.
+    The rule of one standard error (Breiman et al., Classification and Regression Trees, 1984, 3.4.3) is
+    applied to the logarithm of the error, so that each fold counts equally; errors below 1 um count as that.
     """
     if other.examination is None or best.examination is None:
         return False
     before, after = best.examination.left_out, other.examination.left_out
     if len(before) < 2 or len(before) != len(after):
         return False
-    gains = np.log(np.maximum(before, EXACT) / np.maximum(after, EXACT))
-    return float(gains.mean()) > max(WORTHWHILE, float(gains.std(ddof=1)) / math.sqrt(len(gains)))
+    gains = np.log(np.maximum(before, 1e-6) / np.maximum(after, 1e-6))
+    return float(gains.mean()) > max(0.02, float(gains.std(ddof=1)) / math.sqrt(len(gains)))

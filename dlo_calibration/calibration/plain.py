@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plain values of a result: numbers, texts, lists and dicts, of which every other form of it is made."""
+"""Plain values of a result: numbers, texts, lists and dicts, from which every other form is made."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from dlo_calibration.model.score import PointErrors
 
 def plain(result: CalibrationResult) -> dict[str, Any]:
     """
-    Return what a calibration found as plain values, under the keys that `fit --json` prints.
+    Return a result as plain values, under the keys that `fit --json` prints.
 
-    SI units; scores in cm; `value`, `std`, `lower` and `upper` on the scale from 0 to 100.  None is what is
-    not known.
+    Units are SI; scores are in cm; `value`, `std`, `lower` and `upper` are on the scale from 0 to 100.
+    None stands for an unknown value.
     """
     found, other, advice = result.examination, result.confirmation, result.advice
-    told: dict[str, Any] = known({
+    values: dict[str, Any] = known({
         'parameters': {name: _without_name(one) for name, one in result.parameters.items()},
         **_fit(result.best.score, result.best.scores, result.errors),
         'error_percent_of_length': 100 * result.errors.mean / result.length,
@@ -41,15 +41,15 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'confirmation': other and {
             'engine': other.engine, **_fit(other.score, other.scores, other.errors),
             'mean_distance_m': other.mean_distance, 'max_distance_m': other.max_distance}})
-    return told
+    return values
 
 
 def evaluation_rows(result: CalibrationResult) -> tuple[list[str], list[list[Any]]]:
     """
-    Return the head and the rows of a table of all evaluations, counted from 1.
+    Return the head and the rows of a table of all evaluations, which are numbered from 1.
 
-    Parameters are on the scale from 0 to 100, scores in cm, the mean point error in m; '' is what an
-    evaluation that failed does not have.
+    Parameters are on the scale from 0 to 100, scores in cm, the mean point error in m. Cells that a failed
+    evaluation cannot fill are ''.
     """
     names, trials = result.space.free, [trial.name for trial in result.trials]
     head = ['evaluation', *names, 'score', *(f'score of {name}' for name in trials), 'mean_error_m',
@@ -60,7 +60,7 @@ def evaluation_rows(result: CalibrationResult) -> tuple[list[str], list[list[Any
 
 
 def known(value: Any) -> Any:
-    """Return plain values with None in place of numbers that are not finite, which JSON does not know."""
+    """Return plain values with None in place of numbers that are not finite, which JSON cannot express."""
     if isinstance(value, Mapping):
         return {str(key): known(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
@@ -78,7 +78,7 @@ def _fit(score: float, scores: Sequence[float], errors: PointErrors) -> dict[str
 
 
 def _correlations(result: CalibrationResult) -> dict[str, dict[str, float]] | None:
-    """Return the correlation of each two parameters; None where it is not known."""
+    """Return the correlation of each pair of parameters; None if it is unknown."""
     found, names = result.examination, result.space.free
     if found is None or not found.regular or found.uncertainty.correlations is None:
         return None

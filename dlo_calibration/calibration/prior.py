@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The prior of a calibration: what the observed chains alone say of its parameters."""
+"""The prior of a calibration: estimates of the parameters from the observed chains alone."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.search import Hints
 
-#: The height at which the DLO lies tells this radius; no other parameter has a guess where no trial shows it.
+#: The height at which the DLO lies gives this radius, even if no trial shows self-contact.
 GUESSED = 'self_collision'
 
 
 @dataclass(frozen=True)
 class Prior:
     """
-    What is known before anything is simulated.
+    What is known before the first simulation.
 
-    :param space: the parameters to find; defaults that the chains contradict are replaced by guesses.
+    :param space: the parameters to find; an estimate replaces the default of those in `guessed`.
     :param hints: for the search.
-    :param guessed: names of the parameters whose default is such a guess.
+    :param guessed: names of the parameters whose default was replaced.
     """
 
     space: ParameterSpace
@@ -37,7 +37,7 @@ class Prior:
 
 
 def prior(trials: Sequence[Trial], options: Options) -> Prior:
-    """Return what the observed chains alone say of the parameters that `options` ask for."""
+    """Return the prior of the parameters to find, from the observed chains alone."""
     space = options.space
     height = options.table_height if options.table else None
     shown = np.logical_or.reduce(excites(trials, space, height))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far a calibration has come."""
+"""The progress of a calibration."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from dlo_calibration.inference.uncertainty import good_count
 
 class Progress:
     """
-    How far a calibration has come.
+    The progress of a calibration.
 
-    :param evaluations: how many there will be at most.
-    :param trials: simulated in each of them.
+    :param evaluations: largest number of evaluations.
+    :param trials: number of trials that each evaluation simulates.
+    :param clock: the time [s].
     """
 
     def __init__(self, evaluations: int, trials: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -33,7 +34,7 @@ class Progress:
         self._clock, self._begun = clock, clock()
 
     def take(self, evaluation: Evaluation) -> None:
-        """Take the next evaluation."""
+        """Count the next evaluation."""
         self.count += 1
         self._simulations += self._trials - evaluation.skipped
         self.newest = evaluation
@@ -46,9 +47,9 @@ class Progress:
     @property
     def spread(self) -> dict[str, float]:
         """
-        How far the best 5 % of the evaluations so far (8 at least) lie from the best, 0..100, by parameter.
+        Spread of the best 5 % of the evaluations so far (8 at least) around the best, 0..100, by parameter.
 
-        The root mean square distance, as in `uncertainty.spread_of_best`.
+        It is the root mean square distance, as in `uncertainty.spread_of_best`.
         """
         good = self._good[:good_count(self.count)]
         if self.best is None or not good:

@@ -26,21 +26,18 @@ from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Trial
 
-DEFAULT = 'no trial tells anything about it; it keeps its default'
-GUESS = 'no trial tells anything about it; guessed from the height at which the DLO lies'
-
 
 @dataclass(frozen=True)
 class ParameterEstimate:
     """
-    One found parameter.
+    One calibrated parameter.
 
-    `value`, `std`, `lower`, `upper` are on the 0..100 scale; the others are the
-    same in `physical_unit`; the interval is one of 90 %.  `identifiable` is False
-    where the trials could not tell its value.
+    `value`, `std` and the 90 % interval from `lower` to `upper` are on the 0..100 scale; `physical_value`,
+    `physical_lower` and `physical_upper` are the same in `physical_unit`.
 
+    :param identifiable: False if the trials do not determine the value.
     :param verdict: identifiable, weak, or not identifiable; see `uncertainty`.
-    :param note: what else is to be known, in words; empty where nothing is.
+    :param note: a remark for the user; may be empty.
     """
 
     name: str
@@ -60,13 +57,13 @@ class ParameterEstimate:
 @dataclass(frozen=True)
 class CalibrationResult:
     """
-    What a calibration found, and how.
+    The result of a calibration.
 
-    :param chains: (g, n, 3) [m] the simulated goals of each trial.
-    :param examination: of the surroundings of what was found; None where there was no time for it.
-    :param advice: which action to observe next; None where none would help, or it was not asked for.
-    :param missing_parameters: what more of the object would explain of what the fit leaves over; empty where
-        that is noise, or it was not asked for.
+    :param chains: (g, n, 3) simulated chains at the goals of each trial [m].
+    :param examination: of the surroundings of the best evaluation; None if the user stopped before.
+    :param advice: which action to observe next; None if none would help, or it was not computed.
+    :param missing_parameters: fixed parameters that would explain part of the residuals; empty if noise
+        explains the residuals, or if it was not computed.
     """
 
     space: ParameterSpace
@@ -88,7 +85,7 @@ class CalibrationResult:
 
     @classmethod
     def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:
-        """Return what a fit found; `seconds` is 0 until the calibration has ended."""
+        """Return the result of a fit; `seconds` is 0 until the calibration has ended."""
         trials, best, examination = setting.trials, found.best, found.examination
         uncertainty = spread_of_best(found.evaluations, best.point)
         if examination is not None:
@@ -124,37 +121,41 @@ class CalibrationResult:
 
     @property
     def simulations(self) -> int:
-        """Rollouts that were simulated, by the search and by the examination."""
+        """Number of rollouts that the search and the examination simulated."""
         examined = 0 if self.examination is None else self.examination.evaluations
         return examined * len(self.trials) + sum(
             len(self.trials) - evaluation.skipped for evaluation in self.evaluations)
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Combinations of parameters that the trials leave open, in words."""
+        """Combinations of parameters that are not identifiable, in words."""
         if self.examination is None or not self.examination.regular:
             return ()
         return tuple(combination(self.space.free, vector)
                      for vector in self.examination.uncertainty.undetermined)
 
     def physical(self) -> dict[str, float]:
-        """Every parameter's physical value in SI units, for a rope like the observed one."""
+        """Physical values of all parameters in SI units, for a DLO of the observed length."""
         return self.space.physical(self.values, self.length)
 
 
 def parameter_estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty,
-              guessed: Sequence[str] = ()) -> dict[str, ParameterEstimate]:
+                        guessed: Sequence[str] = ()) -> dict[str, ParameterEstimate]:
     """
     Return the parameters of the best evaluation with their uncertainty, in both units.
 
-    :param guessed: names of those whose default is a guess from the chains alone.
+    :param guessed: names of the parameters whose default was estimated from the chains alone.
     """
     parameters = {}
     for k, name in enumerate(space.free):
         value, lower, upper = (float(x) * SCALE for x in (best.point[k], found.lower[k], found.upper[k]))
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
-        note = '' if found.excited[k] else GUESS if name in guessed else DEFAULT
+        note = ''
+        if not found.excited[k]:
+            note = 'no trial shows it; it keeps its default'
+            if name in guessed:
+                note = 'no trial shows it; estimated from the height at which the DLO lies'
         if found.at_bound[k]:
             note = 'at the end of its scale; the best value may lie beyond'
         verdict = found.verdicts[k]
@@ -178,7 +179,7 @@ def combination(names: Sequence[str], vector: Floats) -> str:
 
 
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
-    """Return the simulated (g, n, 3) [m] chains of each trial, from the residuals."""
+    """Return the simulated chains of each trial, (g, n, 3) [m], from the residuals of an evaluation."""
     assert evaluation.residuals is not None
     apart = ResidualLayout.of(trials).chains(evaluation.residuals)
     return tuple(frozen_array(np.stack([goal.chain.points for goal in trial.goals]) + away)
@@ -188,7 +189,7 @@ def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[F
 def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
     warnings = []
     if best.unsettled:
-        warnings.append(f'never came to rest: {", ".join(best.unsettled)}; compared as it was at the limit')
+        warnings.append(f'never came to rest: {", ".join(best.unsettled)}; the last state was compared')
     failed = [evaluation for evaluation in evaluations if evaluation.failure]
     if failed:
         warnings.append(f'{len(failed)} of {len(evaluations)} evaluations could not be simulated: '

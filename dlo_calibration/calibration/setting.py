@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The setting of a calibration: what all its stages share."""
+"""The setting of a calibration, which all its stages share."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from dlo_calibration.simulation.protocol import Simulator
 @dataclass(frozen=True)
 class Setting:
     """
-    What all stages of a calibration share.
+    The trials, options, engine and callbacks that all stages of a calibration share.
 
     :param trials: to calibrate on, at least one.
     :param simulator: the engine, which belongs to this thread.
-    :param executor: where evaluations are simulated; None: in this thread, one after the other.
-    :param should_stop: asked often; once True, every stage ends with what it has.
+    :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
+    :param should_stop: asked often; once True, every stage ends with what it has so far.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
     """
 
@@ -39,11 +39,11 @@ class Setting:
 
     @property
     def chooses_parts(self) -> bool:
-        """Whether the number of parts is to be found, and can be: by cross-validation over the trials."""
+        """Whether cross-validation over the trials chooses the number of parts."""
         return self.options.parts == 0 and len(self.trials) > 1 and 'flexibility' in self.options.calibrate
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
                  simulator: Simulator | None = None) -> BatchEvaluator:
-        """Return what evaluates points of a space, on the trials with the engine unless others are given."""
+        """Return an evaluator of points of a space, by default with the setting's trials and engine."""
         evaluator = Evaluator(trials or self.trials, space, simulator or self.simulator)
         return BatchEvaluator(evaluator, self.should_stop, self.executor)

@@ -26,11 +26,11 @@ from dlo_calibration.inference.missing_parameters import missing_parameters
 from dlo_calibration.inference.slices import seconds_for, simulate_slices, Slices
 from dlo_calibration.simulation.protocol import Simulator
 
-STOPPED_PATIENCE = 5.0  # s that a confirmation may still take once it was asked to stop
+STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop, which users wait for
 
 
 def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
-    """Return a result with the action that would tell most, if its uncertainty is known."""
+    """Return a result with the action to observe next, if its covariance is valid."""
     if result.examination is None or not result.examination.regular:
         return result
     return replace(result, advice=advise(
@@ -40,9 +40,9 @@ def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
 
 def with_missing_parameters(setting: Setting, result: CalibrationResult) -> CalibrationResult:
     """
-    Return a result with the parameters that were held fixed and would explain what the fit leaves over.
+    Return a result with the fixed parameters that would explain part of its residuals.
 
-    Each of them is simulated once, and only where the residuals are larger than the noise.
+    Each of them is simulated once, and only if noise alone does not explain the residuals.
     """
     found, best = result.examination, result.best
     if found is None or not found.regular or best.residuals is None or found.noise_alone:
@@ -58,10 +58,10 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
               should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
     """
-    Return a result with what a second engine gives, where `options` leave the choice of the engine open.
+    Return a result with the confirmation by a second engine, if `options` name none (auto).
 
-    It costs one evaluation. Whatever the second engine does, the result is not lost: where the engines
-    disagree, or the second one fails, it stands, with a warning.
+    This costs one evaluation. If the engines disagree, or the second one fails, the result only gets a
+    warning.
     """
     if options.engine != AUTO or result.engine == CONFIRMING:
         return result
@@ -104,13 +104,13 @@ def _confirmed(result: CalibrationResult, simulator: Simulator,
 def sliced(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
            should_stop: Callable[[], bool] = lambda: False) -> Slices | None:
     """
-    Simulate slices around a result, in this thread; None where the engine fails.
+    Simulate slices around a result, in this thread; None if the engine fails.
 
-    They may be coarse, as the time for them is short: see `slices.simulate_slices`.
+    The time for them is limited, so that they may be coarse: see `slices.simulate_slices`.
     """
     try:
         with closing(make_simulator(options)) as simulator:
             return simulate_slices(Evaluator(result.trials, result.space, simulator), result.best, result.std,
                        result.examination, seconds=seconds_for(result.seconds), should_stop=should_stop)
-    except Exception:  # whatever the engine does, there is a page
+    except Exception:  # the page is written even if the engine fails
         return None

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The surroundings of a fit: what is simulated around the best parameter set, so that its intervals hold."""
+"""The surroundings of a fit: simulations around the best parameter set, which its intervals need."""
 
 from __future__ import annotations
 
@@ -23,19 +23,15 @@ from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
-UNLIKELY = 2.71  # chi-square, one degree of freedom, that 10 % exceed
-FURTHEST = 0.1  # that excited parameters follow those that are set to their default, in the unit cube
-STARTS = 16  # initial chains that are simulated with other noise, over all trials
-
 
 def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
     """
-    Return a fit with the examination of its surroundings, and with its best evaluation as it is reported.
+    Return a fit with the examination of its surroundings, and with the evaluation to report as its best.
 
-    A parameter that no trial shows gets its default instead of what it had by chance, unless the
-    trials refute the default. A fit that was stopped, before or now, has no examination.
+    A parameter that no trial shows gets its default instead of a random value, unless the fit becomes
+    significantly worse. If the user stops, there is no examination.
 
-    :param thorough: False: only what cross-validation needs; the intervals are not to be used then.
+    :param thorough: False: only what cross-validation needs; the intervals may be wrong.
     """
     if fit.stopped:
         return replace(fit, examination=None)
@@ -49,7 +45,7 @@ def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
 
 def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, Evaluation]:
     """
-    Return the examination, and the best evaluation as it is reported.
+    Return the examination, and the evaluation to report as the best.
 
     :raises CancelledError: when stopped.
     """
@@ -81,33 +77,33 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
     again = replace(min(seen, key=lambda one: loss.cost(one.residuals)), index=best.index)
     examination = replace(examination, evaluations=examination.evaluations + len(points))
     found = examination.uncertainty
-    # The cost is half the sum of squares.
+    # The cost is half the sum of squares; 10 % exceed a chi-square of 2.71 with one degree of freedom.
     worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / found.scale**2
-    if worse > UNLIKELY * int((point != best.point).sum()):  # what was found stays, unknown as it is
+    if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the found values stay
         found = replace(found, excited=excited | (point != best.point))
         return replace(examination, uncertainty=found), best
     return examination, again
 
 
 def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDArray[np.bool_]) -> Floats:
-    """Return the (d,) point where the excited parameters have followed the others, by a Gauss-Newton step."""
+    """Return the (d,) `point` after a Gauss-Newton step of the excited parameters, of 0.1 at most in each."""
     assert best.residuals is not None
     fit = Linearisation(best.point, best.residuals, jacobian)
     there = replace(fit, residuals=fit.predicted(point - best.point))
     step = there.columns(excited).weighted(Huber.of(best.residuals).roots(best.residuals)).step()
     moved = np.array(point)
-    moved[excited] = np.clip(point[excited] + np.clip(step, -FURTHEST, FURTHEST), 0.0, 1.0)
+    moved[excited] = np.clip(point[excited] + np.clip(step, -0.1, 0.1), 0.0, 1.0)
     return moved
 
 
 def _other_starts(trials: Sequence[Trial], sigma: float) -> list[tuple[Trial, ...]]:
     """
-    Return copies of the trials whose initial chains have other noise, a few if there are many trials.
+    Return copies of all trials, whose initial chains have other noise; 16 chains over all trials are enough.
 
-    It is drawn anew onto the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
-    Introduction to the Bootstrap, 1993, 6.5); the same draws each time.
+    New noise is added to the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
+    Introduction to the Bootstrap, 1993, 6.5); every call makes the same draws.
 
-    :param sigma: standard deviation of a coordinate [m].
+    :param sigma: noise level: standard deviation of one coordinate [m].
     """
     generator = np.random.default_rng(0)
 
@@ -116,4 +112,4 @@ def _other_starts(trials: Sequence[Trial], sigma: float) -> list[tuple[Trial, ..
         return replace(initial, points=points + generator.normal(0, sigma, points.shape))
 
     return [tuple(replace(trial, initial=drawn(trial.initial)) for trial in trials)
-            for _ in range(-(-STARTS // len(trials)))]
+            for _ in range(-(-16 // len(trials)))]

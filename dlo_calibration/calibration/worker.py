@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Worker: a thread that calibrates; options and trials go in, frozen events come out."""
+"""Worker: a thread that calibrates; it takes trials and options, and puts frozen events on a queue."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ class Failure:
     A calibration that ended without a result.
 
     :param text: one line that says why.
-    :param details: the traceback, where the reason is a defect of the program;
-        else empty.
+    :param details: the traceback if the reason is a defect of the program; else empty.
     """
 
     text: str
@@ -37,7 +36,7 @@ class Failure:
 @dataclass(frozen=True)
 class Notice:
     """
-    Something that the user should know at once, and that does not end the calibration.
+    Something that the user should know immediately, and that does not end the calibration.
 
     :param text: one line, e.g. about a process that died.
     """
@@ -52,10 +51,10 @@ class Worker:
     """
     Calibrates in a thread of its own.
 
-    `events` receives an `Evaluation` for each finished one, in order, a `Notice` where
-    something else is worth to be known, and at the end exactly one `CalibrationResult` or `Failure`.
+    `events` receives each finished `Evaluation`, in order, a `Notice` for anything else that the user
+    should know, and at the end exactly one `CalibrationResult` or `Failure`.
 
-    :param make_simulator: called in the thread, so that an engine lives where it is used.
+    :param make_simulator: makes the engine; called in the thread that uses the engine.
     """
 
     def __init__(self, make_simulator: SimulatorFactory) -> None:
@@ -66,7 +65,7 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """Tell whether the thread still works; events may be waiting when it does not."""
+        """Tell whether the thread is running; afterwards, events may still be waiting."""
         return self._thread is not None and self._thread.is_alive()
 
     def start(self, trials: Sequence[Trial], options: Options) -> None:
@@ -83,11 +82,11 @@ class Worker:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask the calibration to end with the best so far; returns at once."""
+        """Ask the calibration to end with the best so far, and return immediately."""
         self._stop.set()
 
     def waiting_events(self) -> Iterator[Event]:
-        """Take what waits in `events`, without waiting for more."""
+        """Yield the waiting `events`, without waiting for more."""
         while True:
             try:
                 yield self.events.get_nowait()

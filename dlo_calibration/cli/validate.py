@@ -56,7 +56,7 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
         seconds = time.monotonic() - begun
     if evaluation.failure:
         raise SimulationError(evaluation.failure)
-    warnings = tuple(f'never came to rest: {name}; compared as it was at the limit'
+    warnings = tuple(f'never came to rest: {name}; the last state was compared'
                      for name in evaluation.unsettled)
     return CalibrationResult(
         space=file.space, parameters=file.parameters, best=evaluation, trials=tuple(trials),

@@ -77,7 +77,7 @@ def test_a_parameter_that_no_trial_tells_about_keeps_its_default_and_says_so():
     damping = result.parameters['damping']
     assert (damping.value, damping.lower, damping.upper) == (50.0, 0.0, 100.0)
     assert damping.verdict == 'not identifiable'
-    assert damping.note == 'no trial tells anything about it; it keeps its default'
+    assert damping.note == 'no trial shows it; it keeps its default'
     assert result.best.values == result.values
 
 

@@ -56,15 +56,15 @@ def test_bullet_is_one_option_away(notices):
 def test_the_compiled_engine_refuses_a_scene_by_name(scene):
     with pytest.raises(InputError) as refusal:
         make_simulator(Options(engine='compiled', scene=scene))
-    assert str(refusal.value) == (f'engine compiled: got scene {scene}, expected no scene, for it knows only '
+    assert str(refusal.value) == (f'engine compiled: got scene {scene}, expected no scene: it simulates only '
                                   'a table; use engine bullet or auto')
 
 
 def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert notices() == [f'rounds are simulated by PyBullet, about 30 times slower, because engine compiled '
-                         f'knows no scene: {scene}']
+    assert notices() == [f'PyBullet simulates the evaluations, about 30 times slower, because engine '
+                         f'compiled does not support a scene: {scene}']
 
 
 @pytest.mark.parametrize('engine', ['auto', 'bullet'])

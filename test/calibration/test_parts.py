@@ -68,7 +68,7 @@ def test_a_small_budget_leaves_the_dlo_even_and_says_so(stiff_middle):
     result = calibrated(stiff_middle, budget=13)
     assert result.space.free == EVEN.free
     assert len(result.evaluations) <= 13
-    assert result.stop_reason.endswith('1 part: too few evaluations are left of the budget to try 2')
+    assert result.stop_reason.endswith('1 part: the rest of the budget is too small to try 2')
 
 
 def test_without_a_second_trial_nothing_can_be_left_out(stiff_middle):

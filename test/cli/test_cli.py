@@ -370,5 +370,5 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
 def test_compiled_engine_and_scene_end_with_one_line(session, capsys):
     assert cli.main(['fit', str(session), '--engine', 'compiled', '--scene', 'peg.urdf']) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        'dlo-calibration: engine compiled: got scene peg.urdf, expected no scene, for it knows only a table; '
+        'dlo-calibration: engine compiled: got scene peg.urdf, expected no scene: it simulates only a table; '
         'use engine bullet or auto')
