@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a person reads: sentences, tables, pictures and the page of a result.
+The result for a reader: sentences, tables, pictures and the page.
 
 Sentences are in `sentences`, tables in `terminal`, pictures in `drawing` and `animation`, the page in `page`.
-They are imported where they are used, as Matplotlib, Rich and Jinja2 take long to load.
+Other modules import them only when they are needed, because Matplotlib, Rich and Jinja2 load slowly.
 """

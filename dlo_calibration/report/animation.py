@@ -19,21 +19,18 @@ from dlo_calibration.report.drawing import hand_colours, numbered, View
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.protocol import Simulator
 
-FRAME_RATE = 10  # 1/s; GIF counts time in 0.01 s
-MOST_FRAMES = 120  # of the motion; a longer one is shown faster
-AFTERWARDS = 1.0  # s that are shown after the last hand has arrived
-PAUSE = 1.6  # s that the end is shown
-DOTS_PER_INCH = 80
+FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
+MOST_FRAMES = 120  # keeps the file small: a longer motion is shown faster
 
 
 @dataclass(frozen=True)
 class Motion:
     """
-    A simulated trial over time.
+    The simulated motion of a trial.
 
-    :param times: (k,) [s] of the trial, increasing.
-    :param chains: (k, n, 3) [m] simulated then.
-    :param ends: (g, n, 3) [m] simulated at the goals of the trial.
+    :param times: (k,) times in the trial [s], increasing.
+    :param chains: (k, n, 3) simulated chains at these times [m].
+    :param ends: (g, n, 3) simulated chains at the goals of the trial [m].
     """
 
     times: Floats
@@ -42,14 +39,14 @@ class Motion:
 
 
 def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
-    """Return a trial with timed goals, named by nothing but their time, between those that it has."""
-    last = max(max(hand.end for hand in trial.hands) + AFTERWARDS, trial.goals[-1].time)
+    """Return a trial with additional timed goals, one for each frame; their chains are placeholders."""
+    last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
     taken = {goal.time for goal in trial.goals}
     count = min(frames, max(2, round(last * FRAME_RATE) + 1))
     added = []
     for time in np.linspace(0.0, last, count):
         if float(time) not in taken:
-            # A hand holds in between what it holds in the next goal, as in the trial itself.
+            # Between two goals, the hands hold what they hold at the later one, as in the trial itself.
             following = next((goal for goal in trial.goals if goal.time > time), trial.goals[-1])
             added.append(Goal(trial.initial, float(time), stable=False, held_by=following.held_by))
     return replace(trial, goals=(*trial.goals, *added))
@@ -57,25 +54,25 @@ def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
 
 def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, float]) -> Motion:
     """
-    Simulate a trial, and keep how the DLO moved.
+    Simulate a trial, and return the motion of the DLO.
 
     :param physical: parameters by name (SI units).
-    :raises SimulationError: where the rollout diverges.
+    :raises SimulationError: if the rollout diverges.
     """
     dense = densely(trial)
     chains = simulator.simulate(dense, physical).chains
     asked = {id(goal.chain) for goal in trial.goals}
     ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in asked]
-    # A stable goal shows the DLO at rest, which is later than its stamp says.
+    # A stable goal is simulated until the DLO rests, which is later than its time.
     shown = [k for k, goal in enumerate(dense.goals) if not goal.stable]
     return Motion(np.array([dense.goals[k].time for k in shown]), chains[shown], chains[ends])
 
 
 def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
     """
-    Write a GIF: from above on the left, from the side on the right, the goal as it was measured.
+    Write a GIF with the simulated motion and the measured goal, from above (left) and from the side (right).
 
-    :raises InputError: where the file cannot be written.
+    :raises InputError: if the file cannot be written.
     """
     from matplotlib.animation import PillowWriter
 
@@ -84,12 +81,12 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
     try:
         with settings():
             scene = _Scene(trial, motion, speed)
-            with writer.saving(scene.figure, str(path), DOTS_PER_INCH):
+            with writer.saving(scene.figure, str(path), dpi=80):
                 for time, chain in zip(motion.times, motion.chains, strict=True):
                     scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
                     writer.grab_frame()
                 scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
-                for _ in range(round(PAUSE * FRAME_RATE)):
+                for _ in range(round(1.6 * FRAME_RATE)):  # a pause, to look at the end
                     writer.grab_frame()
     except OSError as error:
         raise unwritable(path, error) from error
@@ -98,12 +95,12 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
 def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],
                      folder: Path, note: Callable[[str], None]) -> list[Path]:
     """
-    Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is made.
+    Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is created.
 
     :param physical: parameters by name (SI units).
-    :param note: called with the path of each file, once it is written.
-    :raises InputError: where a file cannot be written.
-    :raises SimulationError: where a trial cannot be simulated.
+    :param note: called with the path of each file after it was written.
+    :raises InputError: if a file cannot be written.
+    :raises SimulationError: if a trial cannot be simulated.
     """
     paths = numbered(trials, folder, '.gif')
     for trial, path in zip(trials, paths, strict=True):
@@ -128,14 +125,14 @@ class _Scene:
             self._moving.append(self._prepare(View(one, trial, above=above), motion))
         add_legend(self.figure, list(axes), columns=3)
         self.figure.draw_without_rendering()
-        self.figure.set_layout_engine('none')  # else the axes would tremble
+        self.figure.set_layout_engine('none')  # a new layout for each frame would move the axes
 
     def _prepare(self, view: View, motion: Motion) -> tuple[View, Any, Any, Mapping[str, Any]]:
         view.draw_start()
         measured, = view.axes.plot(
             *view.flat(self._trial.goals[-1].chain.points), 'o', color=OBSERVED, markersize=4,
             alpha=0.5, linestyle='none', zorder=2,
-            label='measured, the last until then' if self._tracked else 'after the action, measured')
+            label='latest measured chain' if self._tracked else 'after the action, measured')
         line, = view.axes.plot(*view.flat(motion.chains[0]), 'o-', color=SIMULATED, linewidth=2.5,
                                markersize=3, label='simulated', zorder=3)
         hands = {}
@@ -151,12 +148,12 @@ class _Scene:
         return view, measured, line, hands
 
     def show(self, time: float, chain: Floats, when: str) -> None:
-        """Show an instant of the trial [s]."""
+        """Show the chain and the hands at a time of the trial [s]; `when` goes into the title."""
         self._title.set_text(as_text(f'{self._trial.name}, simulated: {when}{self._speed}'))
         holding = {hand.name for hand in self._trial.holding(self._goal_at(time))}
         begun = [hand for hand in self._trial.hands if hand.start <= time]
         current = {**{hand.name: hand for hand in reversed(self._trial.hands)},
-                   **{hand.name: hand for hand in begun}}  # the latest of a name, else its first
+                   **{hand.name: hand for hand in begun}}  # the latest of each name, or the first
         seen = [goal.chain for goal in self._trial.goals if goal.time <= time] or [self._trial.initial]
         for view, measured, line, hands in self._moving:
             line.set_data(*view.flat(chain))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drawing: measured and simulated chains of a trial, and their errors, for a PNG, a GIF and the page."""
+"""Drawings of a trial: measured and simulated chains and their errors, for a PNG, a GIF and the page."""
 
 from __future__ import annotations
 
@@ -45,21 +45,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99')
-INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # early to late
-PATH_SAMPLES = 60  # of a hand's path
-LINE_HEIGHT = 0.25  # in, of a legend
+INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # of goals in motion, early to late
 
 
 @dataclass(frozen=True)
 class Drawn:
     """
-    A trial to draw, with what is known of how near the simulation should come.
+    A trial to draw, and the errors to expect.
 
-    :param chains: (g, n, 3) [m] simulated at the goals; None: nothing was simulated.
+    :param chains: (g, n, 3) simulated chains at the goals [m]; None: nothing was simulated.
     :param colours: of the hands, by name.
-    :param noise: standard deviation of a measured coordinate [m]; nan where it is not known.
-    :param band: (n,) [m] standard deviation of the simulated points, the largest of the goals that are shown;
-        None where it is not known.
+    :param noise: noise level: standard deviation of a measured coordinate [m]; nan if unknown.
+    :param band: (n,) standard deviation of the simulated points, the largest of all shown goals [m]; None if
+        unknown.
     """
 
     trial: Trial
@@ -80,7 +78,7 @@ class Drawn:
                    band)
 
     def goals(self) -> list[tuple[int, str | None]]:
-        """Return the goals to show; where there are several, each with a colour of its own."""
+        """Return the indices of the goals to show, with a colour for each if there are several."""
         goals = shown_goals(len(self.trial.goals))
         return [(goal, INSTANT_COLOURS[order] if len(goals) > 1 else None)
                 for order, goal in enumerate(goals)]
@@ -90,16 +88,16 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
     """
     Write a PNG with a row per trial: from above, from the side, and the error of each point.
 
-    :param chains: of each trial, (g, n, 3) [m] simulated at its goals; None: observed only, with
-        how far each point moved in place of the error.
-    :raises InputError: where the file cannot be written.
+    :param chains: of each trial, (g, n, 3) simulated at its goals [m]; None: nothing was simulated, and
+        the distance that each point moved is drawn instead of the error.
+    :raises InputError: if the file cannot be written.
     """
     colours = hand_colours(trials)
-    # Colours of instants are a trial's own, so each row explains them then.
+    # The colours of several goals belong to one trial, so that each row needs its own legend.
     several = any(len(trial.goals) > 1 for trial in trials)
     lines = (2 + len(colours) + 2 * several) * (len(trials) if several else 1)
     with settings():
-        figure = blank_figure(14, 4.3 * len(trials) + LINE_HEIGHT * lines)
+        figure = blank_figure(14, 4.3 * len(trials) + 0.25 * lines)
         rows = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
         explained: list[Axes] = []
         for k, (trial, row) in enumerate(zip(trials, rows, strict=True)):
@@ -120,10 +118,10 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,
                    note: Callable[[str], None]) -> list[Path]:
     """
-    Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is made; see `session_picture`.
+    Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is created; see `session_picture`.
 
-    :param note: called with the path of each file, once it is written.
-    :raises InputError: where a file cannot be written.
+    :param note: called with the path of each file after it was written.
+    :raises InputError: if a file cannot be written.
     """
     paths = numbered(trials, folder, '.png')
     for k, (trial, path) in enumerate(zip(trials, paths, strict=True)):
@@ -133,7 +131,7 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
 
 
 def numbered(trials: Sequence[Trial], folder: Path, suffix: str) -> list[Path]:
-    """Name a file for each trial by its number, as its name may be anything; make the folder."""
+    """Return a path for each trial, numbered because names may contain anything; create the folder."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -142,7 +140,7 @@ def numbered(trials: Sequence[Trial], folder: Path, suffix: str) -> list[Path]:
 
 
 def trial_panels(drawn: Drawn) -> list[Panel]:
-    """Draw a trial for the page: from above, from the side, the error of each point, and its direction."""
+    """Draw a trial for the page: from above, from the side, point errors, and residuals by coordinate."""
     name, chains = drawn.trial.name, drawn.chains
     assert chains is not None
     off = residuals(drawn.trial, chains).reshape(chains.shape)
@@ -162,14 +160,14 @@ def trial_panels(drawn: Drawn) -> list[Panel]:
 
 
 def hand_colours(trials: Sequence[Trial]) -> Mapping[str, str]:
-    """Return a colour for every hand of some trials, by name."""
+    """Return a colour for each hand of the trials, by name."""
     names = sorted({hand.name for trial in trials for hand in trial.hands})
     return {name: HAND_COLOURS[k % len(HAND_COLOURS)] for k, name in enumerate(names)}
 
 
 def hand_path(hand: Hand) -> Floats:
-    """Return (k, 3) [m] the way of a hand, from where it closes to its last waypoint."""
-    return hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, PATH_SAMPLES)))
+    """Return the path of a hand, (k, 3) [m], from where it closes to its last waypoint."""
+    return hand.positions_at(np.union1d(hand.times, np.linspace(hand.start, hand.end, 60)))
 
 
 class View:
@@ -209,8 +207,8 @@ class View:
         """
         Draw a goal.
 
-        :param simulated: (n, 3) [m]; None where nothing was.
-        :param colour: of this one among several goals; None: it is the only one.
+        :param simulated: (n, 3) simulated chain [m]; None: nothing was simulated.
+        :param colour: of this goal among several; None: it is the only one.
         """
         goal = self.trial.goals[index]
         seen = self.flat(goal.chain.points)
@@ -227,12 +225,12 @@ class View:
                        label=None if colour else 'one point, measured and simulated')
 
     def draw_first_point(self) -> None:
-        """Mark the point at which the DLO begins."""
+        """Mark the first point of the DLO."""
         self.axes.plot(*self.flat(self.trial.initial.points[:1]), 'o', markersize=11, markerfacecolor='none',
                        markeredgecolor=OBSERVED, linestyle='none', zorder=6, label='first point of the DLO')
 
     def draw_hands(self, colours: Mapping[str, str]) -> None:
-        """Draw where hands close, move and open."""
+        """Draw the paths of the hands, with their first and last points."""
         for hand in self.trial.hands:
             colour, path = colours[hand.name], hand_path(hand)
             self.axes.plot(*self.flat(path), '--', color=colour, linewidth=1, zorder=4)
@@ -253,7 +251,7 @@ def draw_view(axes: Axes, drawn: Drawn, *, above: bool) -> None:
 
 
 def draw_errors(axes: Axes, drawn: Drawn) -> None:
-    """Draw the error of each point, and how large it should be; without simulation, how far each moved."""
+    """Draw the error of each point and the errors to expect; without a simulation, how far each moved."""
     trial, chains = drawn.trial, drawn.chains
     places = trial.initial.arc_lengths()
     for goal, colour in drawn.goals():
@@ -267,11 +265,10 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
         axes.axhline(mean, color=SIMULATED, linestyle=':', linewidth=1.2, label='mean error')
     if math.isfinite(drawn.noise):
         axes.axhline(drawn.noise * MEAN_DISTANCE * 1e3, color=FAINT, linestyle=(0, (6, 3)), linewidth=1.2,
-                     label='error that the noise of the measured points alone would give')
+                     label='error from the noise of the measured points alone')
     if drawn.band is not None:
         axes.fill_between(places, 0.0, drawn.band * 1e3, color=BLUE, alpha=0.25, linewidth=0, label=(
-            'how far a simulated point may lie elsewhere, given how well the parameters are known '
-            '(one standard deviation)'))
+            'error of a simulated point from the uncertainty of the parameters (one standard deviation)'))
     for hand in trial.hands:
         for k, grip in enumerate(hand.grips):
             axes.axvline(places[grip], color=drawn.colours[hand.name], linestyle='--', linewidth=1,
@@ -284,14 +281,14 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
 
 
 def _draw_differences(axes: Axes, drawn: Drawn) -> None:
-    """Draw along which axis the simulated points of the last goal are off."""
+    """Draw the residuals of the last goal along each axis."""
     trial, goal = drawn.trial, drawn.trial.goals[-1]
     assert drawn.chains is not None
     places = trial.initial.arc_lengths()
     if math.isfinite(drawn.noise):
         reach = DEVIATIONS * drawn.noise * 1e3
         axes.axhspan(-reach, reach, color=FAINT, alpha=0.25, linewidth=0,
-                     label='noise of the measured points (90 % of it)')
+                     label='noise of the measured points (90 % interval)')
     for axis, values, colour, dashes in zip(
             ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.points).T, (BLUE, YELLOW, GREEN),
             ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
@@ -304,7 +301,7 @@ def _draw_differences(axes: Axes, drawn: Drawn) -> None:
 
 def _title(drawn: Drawn) -> str:
     if drawn.chains is None:
-        return f'{drawn.trial.name}, as it was measured'
+        return f'{drawn.trial.name}, measured'
     errors = PointErrors.of(residuals(drawn.trial, drawn.chains))
     return (f'{drawn.trial.name}: simulated points are {measured(errors.mean, "m")} from the measured ones '
             f'on average ({number(100 * errors.mean / drawn.trial.initial.length)} % of the length), '
@@ -312,9 +309,9 @@ def _title(drawn: Drawn) -> str:
 
 
 def _horizontal_direction(trial: Trial) -> Floats:
-    """Return the horizontal unit vector, (3,), along which a trial extends most."""
+    """Return the horizontal unit vector (3,) along which the trial extends most."""
     points = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])[:, :2]
     direction = np.linalg.eigh(np.cov(points.T))[1][:, -1]
-    # The sign of an eigenvector is arbitrary; a picture of the same trial must not flip.
+    # The sign of an eigenvector is arbitrary; it is fixed so that pictures of the same trial agree.
     direction = direction * (1.0 if direction[np.argmax(np.abs(direction))] > 0 else -1.0)
     return np.array([direction[0], direction[1], 0.0])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figure: what all drawings share: colours, settings, legends, the file of a PNG, the panels of the page."""
+"""Common parts of all drawings: colours, settings, legends, PNG files, and the panels of the page."""
 
 from __future__ import annotations
 
@@ -20,18 +20,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-#: The palette of Okabe and Ito, which colour-blind people tell apart (Color Universal Design, 2008).
+#: The palette of Okabe and Ito, which colour-blind people can distinguish (Color Universal Design, 2008).
 BLUE, GREEN, PURPLE, SKY, YELLOW = '#0072b2', '#009e73', '#cc79a7', '#56b4e9', '#e69f00'
 OBSERVED, SIMULATED, BEFORE, FAINT = 'black', '#d55e00', '0.72', '0.45'
-DOTS_PER_INCH = 110  # of a PNG
-WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page, which is read on a phone, too
-MARGINS = 0.82, 0.12, 0.3, 0.55  # in, left, right, above and below the axes of a panel
-LABEL_WIDTH = 64  # characters that fit into a panel's legend
-LEGEND_LINE, BAR_ROOM = 0.17, 0.8  # in, of a line of that legend, and beside the axes for a bar of colours
-#: Matplotlib's settings are the process's own, and its fonts are not made for threads.
+WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page: it stays readable on a phone
+BAR_ROOM = 0.8  # in, for a colour bar beside the axes
+#: Matplotlib's settings belong to the process, and its fonts are not thread-safe.
 _LOCK = threading.Lock()
 SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'none', 'axes.spines.top': False,
-            'axes.spines.right': False, 'axes.titley': 1.0, 'axes.axisbelow': True}
+                 'axes.spines.right': False, 'axes.titley': 1.0, 'axes.axisbelow': True}
 
 
 @dataclass(frozen=True)
@@ -48,16 +45,16 @@ class Panel:
 
 
 def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Panel:
-    """Draw on axes of their own for the page, with the legend below them."""
-    left, right, top, bottom = MARGINS
+    """Draw a panel for the page, with the legend below the axes; `words` describe it."""
+    left, right, top, bottom = 0.82, 0.12, 0.3, 0.55  # in, margins around the axes
     with settings():
         figure = blank_figure(WIDTH, HEIGHT, layout=None)
         axes = figure.add_axes((0, 0, 1, 1))
         draw(axes)
         handles, labels = axes.get_legend_handles_labels()
-        labels = [textwrap.fill(label, LABEL_WIDTH) for label in labels]
+        labels = [textwrap.fill(label, 64) for label in labels]
         lines = sum(1 + label.count('\n') for label in labels) if legend else 0
-        height = HEIGHT + LEGEND_LINE * (lines + 0.5 * (lines > 0))
+        height = HEIGHT + 0.17 * (lines + 0.5 * (lines > 0))
         figure.set_size_inches(WIDTH, height)
         bars = figure.axes[1:]
         for one, x, width in ((axes, left, WIDTH - left - right - BAR_ROOM * len(bars)),
@@ -74,7 +71,7 @@ def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Pane
 
 @contextmanager
 def settings() -> Iterator[None]:
-    """Draw with the settings of all drawings, one drawing at a time."""
+    """Apply the common settings; only one drawing is made at a time."""
     from matplotlib import rc_context
 
     with _LOCK, rc_context(SETTINGS):
@@ -82,7 +79,7 @@ def settings() -> Iterator[None]:
 
 
 def blank_figure(width: float, height: float, layout: Any = 'constrained') -> Figure:
-    """Return an empty figure [in] that never opens a window or is kept alive: there is no pyplot."""
+    """Return an empty figure [in]; without pyplot, it opens no window and is freed after use."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -95,16 +92,16 @@ def write_figure(figure: Figure, path: str | Path) -> None:
     """
     Write a figure as a PNG.
 
-    :raises InputError: where the file cannot be written.
+    :raises InputError: if the file cannot be written.
     """
     try:
-        figure.savefig(path, format='png', dpi=DOTS_PER_INCH)
+        figure.savefig(path, format='png', dpi=110)
     except OSError as error:
         raise unwritable(path, error) from error
 
 
 def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:
-    """Explain below the figure what is drawn in `axes`, everything once."""
+    """Add a legend below the figure for all `axes`, with each label once."""
     shown: dict[str, Any] = {}
     for one in axes:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
@@ -114,6 +111,6 @@ def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> No
 
 
 def as_text(name: str) -> str:
-    """Return a name so that it is written as it is: neither a formula nor a hidden label."""
+    """Return a name that Matplotlib shows literally: neither as a formula nor as a hidden label."""
     shown = name.replace('$', r'\$')
     return f' {shown}' if shown.startswith('_') else shown

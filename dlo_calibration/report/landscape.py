@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Landscape: how the search came to the result, and how the fit worsens away from it, as drawings."""
+"""Drawings of the search: the scores of its evaluations, and how the fit worsens around the result."""
 
 from __future__ import annotations
 
@@ -18,9 +18,6 @@ from dlo_calibration.report.figure import BEFORE, BLUE, FAINT, OBSERVED, Panel, 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-FEW_DECADES = 8.0  # from which on an axis shows 1, 2, 5, 10, ...; below it, any round numbers
-SMALLEST_ERROR, SMALLEST_SCORE = 1e-6, 1e-2  # [m], [cm]; what an error is compared with is not smaller
 
 
 def convergence_panel(result: CalibrationResult) -> Panel:
@@ -53,7 +50,7 @@ def line_panels(result: CalibrationResult, lines: Sequence[Line]) -> list[Panel]
 
 
 def plane_panels(result: CalibrationResult, plane: Plane) -> list[Panel]:
-    """Draw how the fit worsens with two parameters: the error, and the score."""
+    """Draw how the fit worsens while two parameters vary: the error, and the score."""
     drawn = (('root mean square error', 'mm', 1e3 * plane.errors), ('difference score', 'cm', plane.scores))
     return [_plane(result, plane, what, unit, values) for what, unit, values in drawn
             if values[np.isfinite(values)].max(initial=0.0) > 0]
@@ -61,8 +58,9 @@ def plane_panels(result: CalibrationResult, plane: Plane) -> list[Panel]:
 
 def _line(result: CalibrationResult, line: Line, legend: bool) -> Panel:
     found = result.parameters[line.name]
-    errors = line.errors / max(result.errors.rms, SMALLEST_ERROR)
-    scores = line.scores / max(result.best.score, SMALLEST_SCORE)
+    # A result that fits exactly would make the ratios infinite.
+    errors = line.errors / max(result.errors.rms, 1e-6)
+    scores = line.scores / max(result.best.score, 1e-2)
 
     def draw(axes: Axes) -> None:
         axes.axvspan(*np.clip([found.lower, found.upper], line.values[0], line.values[-1]), color=BEFORE,
@@ -72,7 +70,7 @@ def _line(result: CalibrationResult, line: Line, legend: bool) -> Panel:
                   label='root mean square error of the points')
         _mark(axes, found.value, 1.0)
         axes.set(title=f'along {line.name}', xlabel=f'{line.name} [0 to 100]',
-                 ylabel='times that of the result')
+                 ylabel='multiple of the value at the result')
         _logarithmic(axes, 0.8, 1.25)
 
     return panel(draw, (
@@ -98,7 +96,7 @@ def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values
         bar.ax.set_yticklabels([number(step) for step in steps])
         region = _region(result, plane)
         if region is not None:
-            axes.plot(*region, '--', color=SIMULATED, label='both are in there with 90 % probability')
+            axes.plot(*region, '--', color=SIMULATED, label='90 % region of both parameters')
         _mark(axes, *(result.parameters[name].value for name in plane.names))
         axes.set(title=f'{what} [{unit}]', xlabel=f'{one} [0 to 100]', ylabel=f'{two} [0 to 100]',
                  xlim=plane.values[0, [0, -1]], ylim=plane.values[1, [0, -1]])
@@ -107,13 +105,13 @@ def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values
 
 
 def _region(result: CalibrationResult, plane: Plane) -> Floats | None:
-    """Return (2, k) the border of where both parameters are with 90 % probability; None: not known."""
+    """Return the border of the 90 % region of both parameters, (2, k) on the 0..100 scale; None: unknown."""
     found = result.examination
     if found is None or not found.regular or found.uncertainty.covariance is None:
         return None
     chosen = [result.space.free.index(name) for name in plane.names]
     values, vectors = np.linalg.eigh(found.uncertainty.covariance[np.ix_(chosen, chosen)])
-    radius = np.sqrt(-2 * np.log(0.1))  # of 90 % of a normal distribution in two dimensions
+    radius = np.sqrt(-2 * np.log(0.1))  # holds 90 % of a normal distribution in two dimensions
     angles = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     border = vectors @ (np.sqrt(values)[:, None] * radius * circle)
@@ -126,19 +124,19 @@ def _mark(axes: Axes, x: float, y: float) -> None:
 
 
 def _visible(values: Floats) -> Floats:
-    """Return values with nan for those that a logarithmic axis cannot show."""
+    """Replace values that a logarithmic axis cannot show by nan."""
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
 def _logarithmic(axes: Axes, lowest: float = np.inf, highest: float = 0.0) -> None:
-    """Make the vertical axis logarithmic, with round numbers, from `lowest` to `highest` at least."""
+    """Make the vertical axis logarithmic with round ticks; it includes `lowest` and `highest`."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     axes.set_yscale('log')
     low, high = axes.get_ylim()
     low, high = min(low, lowest), max(high, highest)
     axes.set_ylim(low, high)
-    few = high < FEW_DECADES * low
+    few = high < 8.0 * low  # 1, 2, 5, 10, ... would be too few ticks
     axes.yaxis.set_major_locator(MaxNLocator(5) if few else LogLocator(
         subs=(1, 2, 5) if high < 1e3 * low else (1,)))
     axes.yaxis.set_minor_locator(NullLocator())

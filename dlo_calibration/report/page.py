@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Page: what a calibration found, as one HTML page; page.html is its template."""
+"""The page: a result as one HTML file; page.html is its template."""
 
 from __future__ import annotations
 
@@ -27,20 +27,18 @@ from dlo_calibration.report.landscape import convergence_panel, line_panels, pla
 from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences
 from dlo_calibration.report.terminal import fit_facts
 
-MOST_TRIALS = 12  # that are drawn
-VERSIONS = ('dlo_calibration', 'numpy', 'scipy', 'numba', 'pybullet')
-CHUNK = 1 << 20  # octets of a file that are hashed at once
-MARKS = {IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''}  # classes of the page's style
+MOST_TRIALS = 12  # are drawn, so that the page stays small
 
 
 @dataclass(frozen=True)
 class Origin:
     """
-    What a calibration began with, so that it can be repeated.
+    The input of a calibration, with which it can be repeated.
 
-    :param session: name of what the trials were read from.
-    :param command: that gives the same result again.
-    :param digests: SHA-256 of each file that it was read from, by name.
+    :param session: name of the session or file with the trials.
+    :param command: the command that gives the same result again.
+    :param options: of the calibration.
+    :param digests: SHA-256 of each input file, by name.
     :param problems: of the session, in words.
     """
 
@@ -52,7 +50,7 @@ class Origin:
 
 
 def repeating_command(session: str, options: Options) -> str:
-    """Return the command that calibrates on a session with the same options."""
+    """Return the command that calibrates on a session with these options."""
     changed = _changed(options)
     return shlex.join(['dlo-calibration', 'fit', session,
                        *(word for name, value in changed.items() for word in as_flags(name, value))])
@@ -62,24 +60,21 @@ def digests(paths: Iterable[Path]) -> dict[str, str]:
     """
     Return the SHA-256 of files, by their name without folders.
 
-    :raises OSError: where one cannot be read.
+    :raises OSError: if a file cannot be read.
     """
     found = {}
     for path in paths:
-        digest = hashlib.sha256()
         with path.open('rb') as stream:
-            while octets := stream.read(CHUNK):
-                digest.update(octets)
-        found[path.name] = digest.hexdigest()
+            found[path.name] = hashlib.file_digest(stream, 'sha256').hexdigest()
     return found
 
 
 def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: Slices | None = None) -> None:
     """
-    Write the page, which needs no other file and no network.
+    Write the page as one file, which needs no other file and no network.
 
-    :param slices: through what was found; None: left out.
-    :raises InputError: where the file cannot be written.
+    :param slices: through the found values; None: the page has none.
+    :raises InputError: if the file cannot be written.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -91,13 +86,15 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
     told = plain(result)
     page = environment.get_template('page.html').render(
         told=told, result=result, origin=origin, slices=slices, sentences=sentences(result),
-        quantities={name: BY_NAME[name].quantity for name in told['parameters']}, marks=MARKS,
+        quantities={name: BY_NAME[name].quantity for name in told['parameters']},
+        marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, told), facts=fit_facts(told),
         **_trials(result), convergence=convergence_panel(result),
         lowest_score=min(one.score for one in result.evaluations),
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
-        versions={name: _version(name) for name in VERSIONS},
+        versions={name: _version(name) for name in
+                  ('dlo_calibration', 'numpy', 'scipy', 'numba', 'pybullet')},
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
         changed=_changed(origin.options), defaults=Options().flat(), options=origin.options.flat(),
         declarations=list(declarations()))
@@ -108,19 +105,19 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
 
 
 def _errors(result: CalibrationResult, told: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the mean distances to compare [m], by what they are of; None where one is not known."""
+    """Return the mean distances to compare [m], by their descriptions; None for an unknown one."""
     found, noise = result.examination, told['noise_m']
     return {
         'the parameters above': told['mean_error_m'],
         'a trial that is left out of the fit, predicted from the others': told['cross_validated_error_m'],
         'the default parameters': told['default_error_m'],
         'the noise of the measured points alone': None if noise is None else noise * MEAN_DISTANCE,
-        'how far simulated points may lie elsewhere, as the parameters are not known exactly (one standard '
-        'deviation)': None if found is None or not found.regular else float(found.band.mean())}
+        'the uncertainty of the parameters alone (one standard deviation of the simulated points)':
+            None if found is None or not found.regular else float(found.band.mean())}
 
 
 def _trials(result: CalibrationResult) -> dict[str, Any]:
-    """Return a row for each trial, and the drawings of those with the largest errors, by index."""
+    """Return a table row for each trial, and by index the drawings of those with the largest errors."""
     errors = [PointErrors.of(residuals(trial, chains))
               for trial, chains in zip(result.trials, result.chains, strict=True)]
     worst = sorted(range(len(errors)), key=lambda k: -errors[k].mean)[:MOST_TRIALS]
@@ -135,7 +132,7 @@ def _changed(options: Options) -> dict[str, Any]:
 
 
 def as_flags(name: str, value: Any) -> list[str]:
-    """Return the words of a command that give an option that value."""
+    """Return the command-line arguments that set an option to a value."""
     flag = f'--{name.replace("_", "-")}'
     if isinstance(value, bool):
         return [flag if value else f'--no-{flag[2:]}']

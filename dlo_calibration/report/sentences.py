@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sentences: what a calibration's result says to a person."""
+"""Sentences: the result of a calibration in plain English."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
 
 
 def sentences(result: CalibrationResult) -> list[str]:
-    """Return what is known, how well, what is not, what would tell it, and how far to trust the fit."""
-    return [*_known(result), *_open(result), *_silent(result), *_advice(result), *_fit(result),
-            *_unexplained(result)]
+    """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
+    return [*_known(result), *_undetermined(result), *_uninformative(result), *_advice(result), *_fit(result),
+            *_missing_parameters(result)]
 
 
 def _known(result: CalibrationResult) -> list[str]:
-    """Say of each parameter what it is, those known best first."""
+    """Return a sentence on each parameter, the most certain ones first."""
     found: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
     for name, p in result.parameters.items():
         verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
@@ -33,7 +33,7 @@ def _known(result: CalibrationResult) -> list[str]:
         value = measured(p.physical_value, p.physical_unit)
         ends = interval(p.physical_lower, p.physical_upper, p.physical_unit)
         if verdict == NOT_IDENTIFIABLE:
-            words = f'{name} could not be told'
+            words = f'{name} could not be determined'
             words += f' ({p.note}): {quantity} {value}' if p.note else \
                 f': with these trials, {quantity} may be anything from {ends}'
         else:
@@ -41,25 +41,24 @@ def _known(result: CalibrationResult) -> list[str]:
             words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {ends}'
             words += f' ({p.note})' if p.note else ''
         found[verdict].append(f'{words}.')
-    told = [text for group in found.values() for text in group]
+    texts = [text for group in found.values() for text in group]
     if any(p.physical_unit.endswith(PER_WEIGHT) for p in result.parameters.values()):
-        told.append('The mass was not given, so that stiffnesses are known only in proportion to the '
-                     'weight of the DLO: each is to be multiplied by the weight per length, in N/m.')
+        texts.append('The mass was not given, so that stiffnesses are known only relative to the weight of '
+                     'the DLO: multiply each by the weight per length, in N/m.')
     if result.examination is not None and not result.examination.regular:
-        told.append('The search had not arrived at a minimum, so that the intervals are only the spread '
-                     'of the best parameter sets it tried; more evaluations or another search may narrow '
-                     'them.')
-    return told
+        texts.append('The search has not reached a minimum, so that the intervals are only the spread of the '
+                     'best parameter sets that it tried; more evaluations or another search may narrow them.')
+    return texts
 
 
-def _open(result: CalibrationResult) -> list[str]:
-    return [f'These can change together while the fit stays nearly the same: {words}.'
+def _undetermined(result: CalibrationResult) -> list[str]:
+    return [f'This combination of parameters can change while the fit stays nearly the same: {words}.'
             for words in result.undetermined]
 
 
-def _silent(result: CalibrationResult) -> list[str]:
+def _uninformative(result: CalibrationResult) -> list[str]:
     names = uninformative(result.trials, result.examination) if len(result.trials) > 1 else ()
-    return [f'{", ".join(names)} told nothing: the parameters would be known as well without.'] * bool(names)
+    return [f'{", ".join(names)} added no information: the other trials suffice.'] * bool(names)
 
 
 def _advice(result: CalibrationResult) -> list[str]:
@@ -72,7 +71,7 @@ def _advice(result: CalibrationResult) -> list[str]:
 
 
 def _fit(result: CalibrationResult) -> list[str]:
-    """Say how well it fits, and what that means."""
+    """Compare the error of the fit with other errors."""
     found, mean = result.examination, result.errors.mean
     words = [f'The simulated points are {measured(mean, "m")} from the measured ones on average '
              f'({number(100 * mean / result.length)} % of the length).']
@@ -87,17 +86,17 @@ def _fit(result: CalibrationResult) -> list[str]:
     if np.isfinite(noise):
         words.append(f'The noise of the measured points alone gives {measured(noise, "m")}; ' + (
             'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
-            'the rest is what the model, or the recorded path of a hand, does not explain.'))
+            'the rest comes from errors of the model or of the recorded hands.'))
     return [' '.join(words)]
 
 
-def _unexplained(result: CalibrationResult) -> list[str]:
-    """Say what to calibrate, too."""
+def _missing_parameters(result: CalibrationResult) -> list[str]:
+    """Name fixed parameters to calibrate, too."""
     shares = [f'{one.name} {number(100 * one.share)} %' for one in result.missing_parameters]
     if not shares:
         return []
     names = [one.name for one in result.missing_parameters if one.name != PARTS]
     how = [f'add {" or ".join(names)} to calibrate'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
-    return [f'Parameters that were held fixed would explain about this much of the squared residuals: '
+    return [f'Parameters that were held fixed would explain these shares of the squared residuals: '
             f'{", ".join(shares)}. To calibrate them, too, {"; or ".join(how)}.']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Terminal: progress bars and tables for people; everything goes to the stream that is given."""
+"""Terminal: progress bars and tables, which are written to a given stream."""
 
 from __future__ import annotations
 
@@ -20,20 +20,18 @@ from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report import sentences
 
-WIDTH = 110  # columns where the output is not a terminal
-
 
 def console(stream: TextIO) -> Console:
-    """Return a console on `stream` that wraps no line of a table in a file or a pipe."""
-    return Console(file=stream, width=None if stream.isatty() else WIDTH, highlight=False)
+    """Return a console on `stream`; in a file or a pipe, it is 110 columns wide, so that tables fit."""
+    return Console(file=stream, width=None if stream.isatty() else 110, highlight=False)
 
 
 class SearchBar:
     """
     A progress bar on a terminal; elsewhere nothing is shown.
 
-    :param total: evaluations at most.
-    :param shown: False: never, whatever the stream is.
+    :param total: largest number of evaluations.
+    :param shown: False: nothing is shown on a terminal, either.
     """
 
     def __init__(self, total: int, stream: TextIO, shown: bool = True) -> None:
@@ -50,15 +48,15 @@ class SearchBar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave it as it is."""
+        """Stop updating; the bar stays visible."""
         self._progress.stop()
 
     def take(self, evaluation: Evaluation) -> None:
-        """Go on by one evaluation."""
+        """Advance by one evaluation."""
         self.move(evaluation.index + 1, min(self._best, evaluation.score))
 
     def move(self, count: int, best: float) -> None:
-        """Show that `count` evaluations were tried, and the best score of them."""
+        """Show that `count` evaluations were made, and their best score."""
         self._best = best
         self._progress.update(self._task, completed=count, best=number(best))
 
@@ -67,8 +65,8 @@ class TaskBar:
     """
     A progress bar with the time left, on a terminal; elsewhere nothing is shown.
 
-    :param what: is counted.
-    :param done: how many of the `total` are done already.
+    :param what: is being counted; the label of the bar.
+    :param done: number of the `total` that is done already.
     """
 
     def __init__(self, what: str, total: int, done: int, stream: TextIO) -> None:
@@ -84,7 +82,7 @@ class TaskBar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave it as it is."""
+        """Stop updating; the bar stays visible."""
         self._progress.stop()
 
     def advance(self) -> None:
@@ -93,7 +91,7 @@ class TaskBar:
 
 
 def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return a table of parameters in both units; rows as in the plain values of a result."""
+    """Return a table of parameters in both units, from the rows in the plain values of a result."""
     table = Table(title='parameters')
     for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'verdict'):
         table.add_column(title, justify='left' if title in ('parameter', 'verdict') else 'right')
@@ -124,47 +122,47 @@ def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -
     return table
 
 
-def fit_facts(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return how well the simulated chains fit, and how that was found, from the plain values of a result."""
+def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return facts about the fit and the search, as pairs of texts, from the plain values of a result."""
     facts = [
-        ('difference score', f'{number(told["score"])} cm (below {SIMILAR:g}: similar, '
+        ('difference score', f'{number(values["score"])} cm (below {SIMILAR:g}: similar, '
                              f'below {VERY_SIMILAR:g}: very similar)'),
-        ('mean error', f'{measured(told["mean_error_m"], "m")} '
-                       f'({number(told["error_percent_of_length"])} % of the length)'),
-        ('rms error', measured(told['rms_error_m'], 'm')),
-        ('largest error', measured(told['max_error_m'], 'm')),
-        ('trials', str(told['trials'])),
-        ('evaluations', f'{told["evaluations"]} ({told["simulations"]} simulations) '
-                        f'in {number(told["seconds"])} s'),
-        ('search', f'{told["search"] or "-"}, seed {"-" if told["seed"] is None else told["seed"]}'),
-        ('engine', told['engine'])]
-    other = told['confirmation']
+        ('mean error', f'{measured(values["mean_error_m"], "m")} '
+                       f'({number(values["error_percent_of_length"])} % of the length)'),
+        ('rms error', measured(values['rms_error_m'], 'm')),
+        ('largest error', measured(values['max_error_m'], 'm')),
+        ('trials', str(values['trials'])),
+        ('evaluations', f'{values["evaluations"]} ({values["simulations"]} simulations) '
+                        f'in {number(values["seconds"])} s'),
+        ('search', f'{values["search"] or "-"}, seed {"-" if values["seed"] is None else values["seed"]}'),
+        ('engine', values['engine'])]
+    other = values['confirmation']
     if other is not None:
         facts.append((
             f'confirmed by {other["engine"]}',
             f'difference score {number(other["score"])} cm, '
             f'mean error {measured(other["mean_error_m"], "m")}; '
-            f'points {measured(other["mean_distance_m"], "m")} from those of {told["engine"]}, '
+            f'points {measured(other["mean_distance_m"], "m")} from those of {values["engine"]}, '
             f'{measured(other["max_distance_m"], "m")} at most'))
-    return [*facts, ('ended', told['stop_reason'])]
+    return [*facts, ('ended', values['stop_reason'])]
 
 
 def print_result(result: CalibrationResult, stream: TextIO,
                  how: Mapping[str, Any] = MappingProxyType({})) -> None:
     """
-    Print tables of the parameters and of the fit, and what the result says in sentences.
+    Print tables of the parameters and of the fit, then the sentences of the result.
 
-    :param how: plain values that take the place of the result's own.
+    :param how: plain values that replace those of the result.
     """
-    out, told = console(stream), {**plain(result), **how}
-    out.print(parameter_table(told['parameters']))
-    out.print(facts_table('fit', fit_facts(told)))
+    out, values = console(stream), {**plain(result), **how}
+    out.print(parameter_table(values['parameters']))
+    out.print(facts_table('fit', fit_facts(values)))
     for sentence in sentences.sentences(result):
         out.print(escape(sentence))
 
 
 def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
-    """Print what is in a session: the JSON document of `info` as tables."""
+    """Print the JSON document of `info` as tables."""
     out = console(stream)
     out.print(facts_table(about['session'], [
         ('trials', str(len(about['trials']))),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report is a page that tells what was found, in any browser, and needs nothing else."""
+"""The report is a page that shows the result in any browser, and needs no other file."""
 
 import base64
 from dataclasses import replace
@@ -129,7 +129,7 @@ def test_says_what_is_known_in_units(result, page):
     text = words(page(result))
     for name, estimate in result.parameters.items():
         assert f'{name} is known well' in text or f'{name} is known only roughly' in text \
-            or f'{name} could not be told' in text
+            or f'{name} could not be determined' in text
         assert interval(estimate.lower, estimate.upper, '1') in text
     assert measured(result.errors.mean, 'm') in text
 

@@ -39,7 +39,7 @@ def test_what_is_known_well_comes_first_and_what_is_not_is_no_value(result):
     order = ['friction', 'self_collision', 'elasticity', 'flexibility']
     assert [text.split()[0] for text in told[:4]] == order
     assert 'only roughly' in told[2]
-    assert told[3] == ('flexibility could not be told: with these trials, bending stiffness EI may be '
+    assert told[3] == ('flexibility could not be determined: with these trials, bending stiffness EI may be '
                        'anything from 0.001 to 0.01 N m^2.')
 
 
@@ -54,10 +54,10 @@ def test_fit_is_compared_with_noise(result):
         return sentences(replace(result, examination=replace(result.examination, noise=noise)))[-1]
 
     assert 'about as good as the measurement' in last(1.0)
-    assert 'does not explain' in last(1e-12)
+    assert 'errors of the model' in last(1e-12)
     assert 'noise' not in last(float('nan'))
 
 
 def test_search_that_did_not_arrive_is_told(result):
     told = sentences(replace(result, examination=replace(result.examination, regular=False)))
-    assert any('had not arrived at a minimum' in text for text in told)
+    assert any('has not reached a minimum' in text for text in told)

@@ -64,7 +64,7 @@ def test_result_tells_the_whole(types):
     assert values.pop('seconds') == '9.1'
     assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
     assert float(values.pop('error_percent_of_length')) == pytest.approx(0.1)
-    assert 'friction could not be told' in values.pop('findings')
+    assert 'friction could not be determined' in values.pop('findings')
     for key, millimetres in (('mean', 2), ('rms', 3), ('max', 10), ('mean_abs', 1)):
         assert float(values.pop(f'{key}_error_mm')) == pytest.approx(millimetres)
     assert values == {
