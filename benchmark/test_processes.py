@@ -13,8 +13,9 @@ import time
 from figures import HERE, SAMPLES, side_by_side, table, write
 import pytest
 
+from dlo_calibration.calibration.engines import ENGINES
 from dlo_calibration.calibration.fit import fit
-from dlo_calibration.calibration.options import ENGINES, Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.files.session import read_session

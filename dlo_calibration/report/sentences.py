@@ -58,7 +58,7 @@ def _undetermined(result: CalibrationResult) -> list[str]:
 
 def _uninformative(result: CalibrationResult) -> list[str]:
     names = uninformative(result.trials, result.examination) if len(result.trials) > 1 else ()
-    return [f'{", ".join(names)} added no information: the other trials suffice.'] * bool(names)
+    return [f'{", ".join(names)} added no information about any parameter.'] * bool(names)
 
 
 def _advice(result: CalibrationResult) -> list[str]:

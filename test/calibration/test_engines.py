@@ -11,8 +11,7 @@ from toy_messages import toy_trials
 from dlo_calibration import calibrate
 from dlo_calibration.calibration import engines
 from dlo_calibration.calibration.engines import ENGINES, make_simulator
-from dlo_calibration.calibration.options import ENGINES as NAMES
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.simulation.bullet import BulletSimulator
 
@@ -36,7 +35,8 @@ def scene(tmp_path):
 
 
 def test_what_can_be_chosen_can_be_made():
-    assert set(ENGINES) == set(NAMES)
+    engine, = (one for one in declarations() if one.name == 'engine')
+    assert set(ENGINES) == set(engine.choices)
     assert Options().engine == 'auto'
 
 

@@ -18,8 +18,6 @@ from toy_messages import toy_trials, TRUTH
 from toy_simulator import Deadly, new_toy, ToySimulator
 
 from dlo_calibration import calibrate, DloCalibrationError
-from dlo_calibration.calibration.engines import ENGINES
-from dlo_calibration.calibration.options import ENGINES as ENGINE_NAMES
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
@@ -267,10 +265,6 @@ def test_zero_workers_are_one_per_core():
         assert len(spawned(os.getpid(), len(os.sched_getaffinity(0)))) == processes.cores()
     finally:
         executor.close()
-
-
-def test_every_engine_that_can_be_chosen_exists():
-    assert set(ENGINES) == set(ENGINE_NAMES)
 
 
 def test_progress_tells_speed_and_time_left():
