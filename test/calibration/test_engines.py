@@ -22,7 +22,7 @@ BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0
 @pytest.fixture
 def notices(caplog):
     """Give a function that returns what was told since this process began, which is now."""
-    engines._tell.cache_clear()
+    engines._warn_once.cache_clear()
     caplog.set_level(logging.WARNING, 'dlo_calibration')
     return lambda: [record.getMessage() for record in caplog.records]
 
