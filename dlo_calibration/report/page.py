@@ -83,12 +83,12 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
                               keep_trailing_newline=True)
     environment.filters.update(number=number, exact=exact, squared=lambda text: text.replace('m^2', 'm²'))
     environment.globals.update(measured=measured, interval=interval)
-    told = plain(result)
+    values = plain(result)
     page = environment.get_template('page.html').render(
-        told=told, result=result, origin=origin, slices=slices, sentences=sentences(result),
-        quantities={name: BY_NAME[name].quantity for name in told['parameters']},
+        values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
+        quantities={name: BY_NAME[name].quantity for name in values['parameters']},
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
-        similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, told), facts=fit_facts(told),
+        similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
         **_trials(result), convergence=convergence_panel(result),
         lowest_score=min(one.score for one in result.evaluations),
         lines=[] if slices is None else line_panels(result, slices.lines),
@@ -104,13 +104,13 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
         raise unwritable(path, error) from error
 
 
-def _errors(result: CalibrationResult, told: Mapping[str, Any]) -> dict[str, float | None]:
+def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the mean distances to compare [m], by their descriptions; None for an unknown one."""
-    found, noise = result.examination, told['noise_m']
+    found, noise = result.examination, values['noise_m']
     return {
-        'the parameters above': told['mean_error_m'],
-        'a trial that is left out of the fit, predicted from the others': told['cross_validated_error_m'],
-        'the default parameters': told['default_error_m'],
+        'the parameters above': values['mean_error_m'],
+        'a trial that is left out of the fit, predicted from the others': values['cross_validated_error_m'],
+        'the default parameters': values['default_error_m'],
         'the noise of the measured points alone': None if noise is None else noise * MEAN_DISTANCE,
         'the uncertainty of the parameters alone (one standard deviation of the simulated points)':
             None if found is None or not found.regular else float(found.band.mean())}
