@@ -108,12 +108,14 @@ class TrialInformation:
         improved = self.improved
         if not improved:
             return f'{self.trial} adds nothing new: repeat it only to average noise'
-        change = ', '.join(f'± {SCALE * before:.1f} -> ± {SCALE * after:.1f}'
-                           for name, before, after in zip(self.names, self.before, self.after, strict=True)
-                           if name in improved)
+        shown = ', '.join(
+            f'{name}{" more certain" * (name == improved[0])} '
+            f'(± {SCALE * before:.1f} -> ± {SCALE * after:.1f} of 100)'
+            for name, before, after in zip(self.names, self.before, self.after, strict=True)
+            if name in improved)
         rest = ', '.join(name for name in self.names if name not in improved)
         nothing = f'; it adds nothing about {rest}' if rest else ''
-        return f'{self.trial} makes {", ".join(improved)} more certain ({change} of 100){nothing}'
+        return f'{self.trial} makes {shown}{nothing}'
 
     @property
     def values(self) -> dict[str, Any]:
