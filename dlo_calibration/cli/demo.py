@@ -15,6 +15,7 @@ import json
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -61,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _demo(output: Path, sample: Path, evaluations: int, stop: Callable[[], bool]) -> None:
     session = read_session(sample)
     output.mkdir(parents=True, exist_ok=True)
-    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % LAST_DOMAIN)
+    os.environ['ROS_DOMAIN_ID'] = str(_unused_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.setdefault('ROS_LOG_DIR', str(output.resolve() / 'ros_log'))
     before = set(output.glob('dlo_session_*'))
@@ -195,6 +196,19 @@ class _Robot:
         answer = future.result()
         if not answer.success:
             raise DloCalibrationError(f'the node refuses: {answer.message}')
+
+
+def _unused_domain() -> int:
+    """Return a ROS domain in which no other program of this machine takes part."""
+    for turn in range(LAST_DOMAIN):
+        domain = 1 + (os.getpid() + turn) % LAST_DOMAIN
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', 7410 + 250 * domain))  # the port of a domain's first participant in DDS
+            except OSError:
+                continue
+            return domain
+    return LAST_DOMAIN
 
 
 if __name__ == '__main__':
