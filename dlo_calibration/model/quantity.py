@@ -30,7 +30,7 @@ def number(value: float | None) -> str:
         return '-'
     if value == 0:
         return '0'  # -0.0, too
-    if 1e-4 <= abs(value) < 1e6:
+    if 1e-5 <= abs(value) < 1e6:
         return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
     return f'{value:.3g}'
 

@@ -13,7 +13,7 @@ from dlo_calibration.model.quantity import exact, interval, measured, number
 
 
 @pytest.mark.parametrize('value, text', [
-    (0.000109, '0.000109'), (9.68e-5, '9.68e-05'), (6200.4, '6200'), (22.0, '22'), (0.0, '0'), (-0.0, '0'),
+    (0.000109, '0.000109'), (9.68e-5, '0.0000968'), (6200.4, '6200'), (22.0, '22'), (0.0, '0'), (-0.0, '0'),
     (-1.5, '-1.5'), (999.7, '1000'),
     (3.16e-9, '3.16e-09'), (1234567.0, '1.23e+06'), (None, '-'), (math.nan, '-'), (math.inf, '-')])
 def test_numbers_have_three_digits_that_count(value, text):
