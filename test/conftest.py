@@ -82,7 +82,7 @@ def shared_ros_environment(tmp_path_factory) -> Iterator[Mapping[str, str]]:
 @pytest.fixture
 def without_drawings(monkeypatch):
     """Leave the drawings of pages out."""
-    leave_out_drawings(monkeypatch)
+    leave_out_drawings(monkeypatch.setattr)
 
 
 @pytest.fixture(params=SOURCES)

@@ -238,15 +238,18 @@ def test_trials_that_cannot_be_simulated_end_with_one_line(run, session):
 
 def test_every_option_is_a_flag_with_either_hyphen(run, session):
     flat = Options().flat()
-    for declaration in declarations():
-        if declaration.choices or declaration.name in ('evaluations', 'output_directory'):
-            continue
-        for name in {declaration.name, declaration.name.replace('_', '-')}:
-            value = flat[declaration.name]
-            words = [f'--{name}', value]
+    for hyphen in '_-':
+        words = []
+        for declaration in declarations():
+            if declaration.choices or declaration.name in ('evaluations', 'output_directory'):
+                continue
+            name, value = declaration.name.replace('_', hyphen), flat[declaration.name]
             if isinstance(value, bool):
-                words = [f'--{name}' if value else f'--no-{name}']
-            assert run('info', session, *words)[0] == 0, words
+                words.append(f'--{name}' if value else f'--no-{name}')
+            else:
+                words += [f'--{name}', value]
+        code, _, errors = run('info', session, *words)
+        assert code == 0, errors
 
 
 def test_lists_are_given_as_words_or_with_commas(run, session):
@@ -273,6 +276,7 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 
 PROGRAM = """
 import pathlib, sys
+from drawings import leave_out_drawings
 from toy_simulator import ToySimulator
 from dlo_calibration.cli import main as cli
 from dlo_calibration.report import terminal
@@ -283,6 +287,7 @@ class Bar(terminal.SearchBar):
         pathlib.Path(sys.argv[2]).touch()
 
 terminal.SearchBar = Bar
+leave_out_drawings()
 sys.exit(cli.main(sys.argv[3:], lambda options: ToySimulator(float(sys.argv[1]))))
 """
 

@@ -52,8 +52,9 @@ def run(capsys):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Draw no pictures, which take longer than all the rest."""
-    monkeypatch.setattr('dlo_calibration.experiment.conduct.session_picture', lambda *_: None)
+    """Leave pictures empty, which take longer than all the rest."""
+    monkeypatch.setattr('dlo_calibration.experiment.conduct.session_picture',
+                        lambda trials, chains, path: path.touch())
     monkeypatch.setattr('dlo_calibration.experiment.tables.scatter_picture', lambda *_: None)
 
 
@@ -151,7 +152,7 @@ def test_another_session_may_judge(run, session, tmp_path, undrawn):
     assert len((tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()) == 2
 
 
-def test_sessions_of_one_name_stay_apart(run, session, tmp_path):
+def test_sessions_of_one_name_stay_apart(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other' / 'rope', session_messages(bag_types(), 3, first=2))
     found = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',
                            '--output', tmp_path / 'out')[1])
@@ -168,7 +169,9 @@ import functools
 import sys
 from toy_calibrator import make_toy
 from dlo_calibration.cli import main as cli
+from dlo_calibration.experiment import conduct, tables
 
+conduct.session_picture = tables.scatter_picture = lambda *_: None
 if __name__ == '__main__':
     sys.exit(cli.main(sys.argv[2:], functools.partial(make_toy, float(sys.argv[1]))))
 """
@@ -243,7 +246,7 @@ def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
     assert len(errors.splitlines()) == 1
 
 
-def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path):
+def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path, undrawn):
     short = write_session(tmp_path / 'short', session_messages(bag_types(), 1))
     code, _, errors = run(short, '--output', tmp_path / 'out')
     assert code == 2

@@ -63,11 +63,37 @@ def wait_for_workers(address, count):
         client.wait_for_workers(count, timeout=PATIENCE)
 
 
-@pytest.fixture
-def machines(tmp_path):
-    with running(tmp_path) as (address, processes):
+@pytest.fixture(scope='module')
+def machines(tmp_path_factory):
+    with running(tmp_path_factory.mktemp('machines')) as (address, processes):
         wait_for_workers(address, 2)
         yield address, processes
+
+
+@pytest.fixture(scope='module')
+def scheduler(tmp_path_factory):
+    with running(tmp_path_factory.mktemp('scheduler'), 0) as (address, _):
+        yield address
+
+
+@pytest.fixture
+def start_worker(scheduler):
+    """Give a function that starts a worker of a scheduler which has none; all are killed at the end."""
+    processes = []
+
+    def start(**environment):
+        processes.append(dask('worker', scheduler, '--no-nanny', '--nthreads', '1', **environment))
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        begun = time.monotonic()
+        while client.scheduler_info()['workers']:
+            assert time.monotonic() - begun < PATIENCE
+            time.sleep(0.02)
 
 
 def options(address='', **flat):
@@ -117,26 +143,23 @@ def test_a_stop_leaves_nothing_at_the_scheduler(machines):
             time.sleep(0.05)
 
 
-def test_without_workers_it_says_so_and_waits(tmp_path):
+def test_without_workers_it_says_so_and_waits(scheduler):
     told = []
-    with running(tmp_path, 0) as (address, _), pytest.raises(DloCalibrationError, match='stopped before the'):
-        calibrate(toy_trials(1), options(address),
+    with pytest.raises(DloCalibrationError, match='stopped before the'):
+        calibrate(toy_trials(1), options(scheduler),
                   make_simulator=new_toy, should_stop=lambda: bool(told), on_notice=told.append)
     assert 'has no workers yet' in told[0]
 
 
-def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(tmp_path):
+def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(scheduler, start_worker, tmp_path):
     (tmp_path / 'toy_simulator.py').touch()
-    with running(tmp_path, 0) as (address, processes):
-        for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
-                            (tmp_path, "another version .*'ToySimulator'.* the same version everywhere")):
-            worker = dask('worker', address, '--no-nanny', '--nthreads', '1',
-                          PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
-            processes.append(worker)
-            with pytest.raises(InputError, match=words):
-                calibrate(toy_trials(1), options(address), make_simulator=new_toy)
-            worker.kill()
-            worker.wait()
+    for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
+                        (tmp_path, "another version .*'ToySimulator'.* the same version everywhere")):
+        worker = start_worker(PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
+        with pytest.raises(InputError, match=words):
+            calibrate(toy_trials(1), options(scheduler), make_simulator=new_toy)
+        worker.kill()
+        worker.wait()
 
 
 def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_do(tmp_path):
@@ -145,51 +168,50 @@ def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_d
             calibrate(toy_trials(1), options(address), make_simulator=lambda _: Deadly())
 
 
-def test_the_last_worker_has_a_while_to_come_back(tmp_path, monkeypatch):
+def test_the_last_worker_has_a_while_to_come_back(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', 1.0)
     told = []
-    with running(tmp_path, 1) as (address, _):
-        wait_for_workers(address, 1)
-        with pytest.raises(DloCalibrationError, match='lost its last worker, and none came back within 1 s'):
-            calibrate(toy_trials(1), options(address),
-                      make_simulator=lambda _: Deadly(), on_notice=told.append)
+    start_worker()
+    wait_for_workers(scheduler, 1)
+    with pytest.raises(DloCalibrationError, match='lost its last worker, and none came back within 1 s'):
+        calibrate(toy_trials(1), options(scheduler),
+                  make_simulator=lambda _: Deadly(), on_notice=told.append)
     assert len(told) == 1
     assert 'the scheduler lost the worker' in told[0]
 
 
-def test_a_worker_that_comes_back_goes_on(tmp_path, monkeypatch):
+def test_a_worker_that_comes_back_goes_on(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', PATIENCE)
-    with running(tmp_path, 1) as (address, processes):
-        def replace(evaluation):
-            if evaluation.index == 10:
-                processes[1].kill()
-                processes.append(dask('worker', address, '--no-nanny', '--nthreads', '1'))
+    first = start_worker()
 
-        torn = calibrate(toy_trials(2), options(address),
-                         make_simulator=lambda _: ToySimulator(0.005), on_evaluation=replace)
+    def replace(evaluation):
+        if evaluation.index == 10:
+            first.kill()
+            start_worker()
+
+    torn = calibrate(toy_trials(2), options(scheduler),
+                     make_simulator=lambda _: ToySimulator(0.005), on_evaluation=replace)
     same(torn, calibrate(toy_trials(2), options(), make_simulator=new_toy))
 
 
-def test_a_scheduler_that_is_killed_ends_the_calibration(machines, capfd):
-    address, (scheduler, *_) = machines
-    with pytest.raises(DloCalibrationError, match=f'the scheduler {address} is lost'):
-        calibrate(toy_trials(1), options(address, evaluations=10000),
-                  make_simulator=lambda _: ToySimulator(0.01), on_evaluation=lambda _: scheduler.kill())
+def test_a_scheduler_that_hangs_holds_nobody_up_and_one_that_is_killed_ends_it(tmp_path, capfd):
+    def search(address, **rest):
+        return calibrate(toy_trials(1), options(address, evaluations=10000),
+                         make_simulator=lambda _: ToySimulator(0.01), **rest)
+
+    with running(tmp_path, 1) as (address, (scheduler, _)):
+        seen = []
+
+        def freeze(evaluation):
+            seen.append(evaluation)
+            scheduler.send_signal(signal.SIGSTOP)
+
+        result = search(address, on_evaluation=freeze, should_stop=lambda: bool(seen))
+        assert result.stop_reason == 'stopped on request'
+        scheduler.send_signal(signal.SIGCONT)
+        with pytest.raises(DloCalibrationError, match=f'the scheduler {address} is lost'):
+            search(address, on_evaluation=lambda _: scheduler.kill())
     assert capfd.readouterr() == ('', '')
-
-
-def test_a_scheduler_that_hangs_holds_nobody_up(machines):
-    address, (scheduler, *_) = machines
-    seen = []
-
-    def freeze(evaluation):
-        seen.append(evaluation)
-        scheduler.send_signal(signal.SIGSTOP)
-
-    result = calibrate(toy_trials(1), options(address, evaluations=10000),
-                       make_simulator=lambda _: ToySimulator(0.01), on_evaluation=freeze,
-                       should_stop=lambda: bool(seen))
-    assert result.stop_reason == 'stopped on request'
 
 
 @pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])

@@ -29,8 +29,10 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
-from dlo_calibration.ros.calibrator_node import CalibratorNode
+from dlo_calibration.ros.calibrator_node import CalibratorNode, spin
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
+
+pytestmark = pytest.mark.usefixtures('without_drawings')
 
 
 @pytest.fixture
@@ -245,9 +247,9 @@ def test_unknown_parameter_is_refused_when_the_node_is_made(start_node):
         start_node(masss=1.0)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, number):
-    with child(ros_environment, tmp_path / 'out', '-p', 'workers:=2', '-p', 'evaluations:=10000',
+@pytest.mark.parametrize(('number', 'workers'), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
+def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, number, workers):
+    with child(ros_environment, tmp_path / 'out', '-p', f'workers:={workers}', '-p', 'evaluations:=10000',
                seconds=0.01) as process, robot_of(ros_environment) as robot:
         robot.send(session_messages(TYPES, 1))
         robot.until_status(trials='1')
@@ -308,12 +310,24 @@ def test_killed_node_leaves_a_readable_session_and_no_processes(ros_environment,
     assert fitted(folder, capsys, '--evaluations', '10')['trials'] == 2
 
 
-@pytest.mark.parametrize('arguments', [
-    ('-p', 'masss:=1.0'), ('-p', 'mass:=-1.0'), ('-p', 'mass:=heavy'), ('-p', 'mass'), ('--nonsense',)])
-def test_bad_command_line_ends_with_one_line_and_exit_code_2(ros_environment, tmp_path, arguments):
-    with child(ros_environment, tmp_path / 'out', *arguments) as process:
-        output, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 2
+BAD = (('-p', 'masss:=1.0'), ('-p', 'mass:=-1.0'), ('-p', 'mass:=heavy'), ('-p', 'mass'), ('--nonsense',))
+
+
+def one_line(errors):
+    line, = errors.splitlines()
+    return line.startswith('calibrator: ')
+
+
+@pytest.mark.parametrize('arguments', BAD)
+def test_bad_command_line_is_told_in_one_line_with_exit_code_2(ros_environment, arguments, capfd):
+    assert spin(['--ros-args', *arguments], lambda: False) == 2
+    output, errors = capfd.readouterr()
     assert output == ''
-    assert len(errors.splitlines()) == 1
-    assert errors.startswith('calibrator: ')
+    assert one_line(errors)
+
+
+def test_bad_command_line_ends_the_process(ros_environment, tmp_path):
+    with child(ros_environment, tmp_path / 'out', *BAD[0]) as process:
+        output, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, output) == (2, '')
+    assert one_line(errors)

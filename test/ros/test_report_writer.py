@@ -38,7 +38,7 @@ def test_page_has_slices_simulated_elsewhere(result, tmp_path):
     assert list(reporter.failures()) == []
 
 
-def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path):
+def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path, without_drawings):
     reporter = ReportWriter(lambda _: ToySimulator(0.1))  # the slices would take half a minute
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)
     reporter.close()
@@ -48,7 +48,7 @@ def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path):
 
 
 @pytest.mark.parametrize('engine', [ToySimulator(crash=True), None])
-def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine):
+def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine, without_drawings):
     reporter = ReportWriter(lambda _: engine)
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)
     reporter.close()
@@ -56,7 +56,7 @@ def test_engine_that_fails_costs_the_slices_only(result, tmp_path, engine):
     assert list(reporter.failures()) == []
 
 
-def test_page_that_cannot_be_written_is_told_once(result, tmp_path):
+def test_page_that_cannot_be_written_is_told_once(result, tmp_path, without_drawings):
     reporter = ReportWriter(lambda _: ToySimulator())
     reporter.begin(tmp_path / 'none' / 'report.html', result, ORIGIN)
     reporter.close()

@@ -22,7 +22,7 @@ def live_node(environment, folder, toy=None, **parameters):
     from dlo_calibration.ros.calibrator_node import CalibratorNode
 
     with robot_of(environment) as robot, pytest.MonkeyPatch.context() as patch:
-        leave_out_drawings(patch)
+        leave_out_drawings(patch.setattr)
         robot.calibrator = CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
                 Parameter(name, value=value)

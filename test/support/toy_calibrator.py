@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node with the toy as its engine: `toy_calibrator.py SECONDS_PER_SIMULATION [--ros-args ...]`."""
+"""The node with the toy, without drawings: `toy_calibrator.py SECONDS_PER_SIMULATION [--ros-args ...]`."""
 
 import functools
 import sys
@@ -20,8 +20,11 @@ def main():
     """Run it, as `dlo_calibration.ros.calibrator` runs the real one."""
     stop = StopFlag()
     stop.listen()
+    from drawings import leave_out_drawings
+
     from dlo_calibration.ros.calibrator_node import spin
 
+    leave_out_drawings()
     code = spin(sys.argv[2:], stop, functools.partial(make_toy, float(sys.argv[1])))
     stop.ignore()
     return code
