@@ -15,6 +15,8 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.report.figure import SIMULATED
 
+pytestmark = pytest.mark.usefixtures('without_drawings')  # of the page; the pictures are drawn
+
 
 @pytest.fixture
 def session(tmp_path):
@@ -69,6 +71,7 @@ def test_result_is_drawn_too(run, session, result, tmp_path):
 
 def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 2)
+    monkeypatch.setattr('dlo_calibration.report.animation.DOTS_PER_INCH', 40)
     code, output, _ = run('plot', session, result, '--animation', '--output', tmp_path / 'films', '--json')
     assert code == 0
     assert written(tmp_path / 'films') == ['trial_1.gif', 'trial_1.png', 'trial_2.gif', 'trial_2.png']
