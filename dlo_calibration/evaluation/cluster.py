@@ -12,6 +12,7 @@ import pickle
 import socket
 import threading
 import time
+import traceback
 from typing import Any, Callable, Mapping
 import warnings
 
@@ -73,13 +74,17 @@ class ClusterExecutor(Executor):
         future: Future[Any] = Future()
         # Send bytes and a function of Python's library: any worker and the scheduler can unpickle these.  A
         # worker that fails to unpickle a task, e.g. because a module is missing, leaves without an error.
-        there = self._executor.submit(pickle.loads, pickle.dumps(_Call(call, args, keywords)))
-        self._pending[future] = there
-        future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
-        there.add_done_callback(lambda _: self._pass_on(future))
+        self._send(future, pickle.dumps(_Call(call, args, keywords)))
         if self._given_up is not None:
             self._fail(future, self._given_up)
         return future
+
+    def _send(self, future: Future[Any], packed: bytes) -> None:
+        """Let a worker unpickle a call, which makes it, and give its result to a future."""
+        there = self._executor.submit(pickle.loads, packed)
+        self._pending[future] = there
+        future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
+        there.add_done_callback(lambda _: self._pass_on(future, packed))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End when all submitted calls are done; at once if they are cancelled or need not be waited for."""
@@ -105,13 +110,15 @@ class ClusterExecutor(Executor):
         finally:
             self._silence.end()
 
-    def _pass_on(self, future: Future[Any]) -> None:
-        """Give a future its result, or an error that says what to do."""
+    def _pass_on(self, future: Future[Any], packed: bytes) -> None:
+        """Give a future its result, or an error that says what to do; send the call again if Dask lost it."""
         done = self._pending.get(future)
         if done is None:
             return
         error = CancelledError() if done.cancelled() else done.exception()
-        if error is not None:
+        if _mistaken(error):
+            self._send(future, packed)
+        elif error is not None:
             reason = CancelledError() if self._closed.is_set() else self._explained(error)
             self._fail(future, reason)
             if reason is not error and not self._closed.is_set():
@@ -188,6 +195,17 @@ class _Call:
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return self._made
+
+
+def _mistaken(error: BaseException | None) -> bool:
+    """
+    Tell whether Dask took a result for an error.
+
+    It reads the status of a call after its result has arrived. If the worker is lost in between, Dask
+    unpacks the result as if it were type, exception and traceback (`_cascade_future` of its cfexecutor).
+    """
+    frames = traceback.extract_tb(error.__traceback__) if isinstance(error, TypeError) else []
+    return bool(frames) and frames[-1].name == '_cascade_future'
 
 
 def _missing_module(error: BaseException | None) -> str:

@@ -3,6 +3,7 @@
 
 """A real Dask scheduler with real workers, over TCP on this machine: the same result, whoever dies."""
 
+from concurrent.futures import Future
 from contextlib import contextmanager
 import json
 import os
@@ -11,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -231,3 +233,33 @@ def test_without_the_library_it_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     with pytest.raises(InputError, match=r"pip install 'dlo_calibration\[distributed\]'"):
         calibrate(toy_trials(1), options('tcp://127.0.0.1:1'), make_simulator=new_toy)
+
+
+def test_a_result_that_dask_takes_for_an_error_is_asked_for_again():
+    """A worker may be lost after its result has arrived, and before Dask has looked at its status."""
+    from distributed.cfexecutor import _cascade_future
+    from tornado.ioloop import IOLoop
+
+    class Lost:
+        status = 'lost'
+
+        async def _result(self, raiseit):
+            return 7
+
+    class Scheduler:
+        asked = 0
+
+        def submit(self, load, packed):
+            self.asked += 1
+            there = Future()
+            if self.asked == 1:
+                IOLoop.current().run_sync(lambda: _cascade_future(Lost(), there))
+            else:
+                there.set_result(load(packed))
+            return there
+
+    executor = object.__new__(cluster.ClusterExecutor)
+    executor._executor, executor._pending, executor._given_up = Scheduler(), {}, None
+    executor._closed = threading.Event()
+    assert executor.submit(pow, 2, 3).result(timeout=5) == 8
+    assert executor._executor.asked == 2
