@@ -20,6 +20,7 @@ from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBS
 from dlo_calibration.simulation.protocol import Simulator
 
 FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
+DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
 MOST_FRAMES = 120  # keeps the file small: a longer motion is shown faster
 
 
@@ -81,7 +82,7 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
     try:
         with settings():
             scene = _Scene(trial, motion, speed)
-            with writer.saving(scene.figure, str(path), dpi=80):
+            with writer.saving(scene.figure, str(path), dpi=DOTS_PER_INCH):
                 for time, chain in zip(motion.times, motion.chains, strict=True):
                     scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
                     writer.grab_frame()
