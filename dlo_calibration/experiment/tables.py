@@ -19,7 +19,16 @@ from dlo_calibration.experiment.study import Task
 from dlo_calibration.experiment.summary import complete_runs, Findings, Spread
 from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
-from dlo_calibration.report.figure import as_text, blank_figure, BLUE, GREEN, PURPLE, write_figure, YELLOW
+from dlo_calibration.report.figure import (
+    as_text,
+    blank_figure,
+    BLUE,
+    GREEN,
+    legend_outside,
+    PURPLE,
+    write_figure,
+    YELLOW,
+)
 
 UNKNOWN = 'not known to us'  # for figures of the paper
 #: The paper's validity [cm], by the sample that resembles its object, and its consistency (0..100).
@@ -161,7 +170,7 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
     for which, search in enumerate(searches):
         rows[0].plot([], [], 'o', color=COLOURS[which % len(COLOURS)], label=search)
     rows[0].plot([], [], 'x', color='0.6', label='default, as the trials do not inform about it')
-    figure.legend(loc='outside upper center', ncols=len(searches) + 1, frameon=False)
+    legend_outside(figure, 'upper center', ncols=len(searches) + 1)
     write_figure(figure, path)
 
 

@@ -106,8 +106,17 @@ def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> No
     for one in axes:
         for handle, label in zip(*one.get_legend_handles_labels(), strict=True):
             shown.setdefault(label, handle)
-    figure.legend(list(shown.values()), list(shown), loc='outside lower center', frameon=False,
-                  ncols=min(columns, len(shown)))
+    legend_outside(figure, 'lower center', handles=list(shown.values()), labels=list(shown),
+                   ncols=min(columns, len(shown)))
+
+
+def legend_outside(figure: FigureBase, place: str, **rest: Any) -> None:
+    """Put a legend beside the axes; `rest` is of `Figure.legend`."""
+    add: Any = figure.legend  # its overloads do not know what is passed on
+    try:
+        add(loc=f'outside {place}', frameon=False, **rest)
+    except ValueError:  # Matplotlib 3.6, which Ubuntu 24.04 has, puts legends over the axes only
+        add(loc=place, frameon=False, **rest)
 
 
 def as_text(name: str) -> str:
