@@ -66,7 +66,7 @@ class TrialCollector:
     def clear(self) -> None:
         """Forget all messages and their frame_id."""
         self._frame: str | None = None
-        self._segments = [TrialBuilder((0, 0, ()))]
+        self._builders = [TrialBuilder((0, 0, ()))]
         self._known: dict[Key, Message] = {}
         self._newest: Key = (0, 0, ())
         self._spare = 0
@@ -95,18 +95,18 @@ class TrialCollector:
         self._check(message, key)
         self._frame = message.frame_id
         self._known[key] = message
-        last, without_start = self._segments[-1], len(self._segments) == 1
+        last, without_start = self._builders[-1], len(self._builders) == 1
         if key > self._newest:
             self._newest = key
             if message.kind == INITIAL and last.busy:
                 last = TrialBuilder(key)
-                self._segments.append(last)
+                self._builders.append(last)
             before = last.spare
             error = last.extend(message, self._options)
             self._spare += last.spare - before
         else:
             error = self._insert(message, key)
-        if without_start and len(self._segments) > 1:
+        if without_start and len(self._builders) > 1:
             self._news += self._orphans()
         if self._spare > KEPT:
             self._forget()
@@ -116,8 +116,8 @@ class TrialCollector:
     @property
     def trials(self) -> tuple[Trial, ...]:
         """The complete trials in the order of their stamps: ``trial 1``, ``trial 2``, ..."""
-        complete = [segment for segment in self._segments if segment.complete]
-        return tuple(segment.build(f'trial {k}') for k, segment in enumerate(complete, start=1))
+        complete = [builder for builder in self._builders if builder.complete]
+        return tuple(builder.build(f'trial {k}') for k, builder in enumerate(complete, start=1))
 
     @property
     def frame_id(self) -> str:
@@ -127,12 +127,12 @@ class TrialCollector:
     @property
     def count(self) -> int:
         """Number of complete trials."""
-        return sum(segment.complete for segment in self._segments)
+        return sum(builder.complete for builder in self._builders)
 
     @property
     def incomplete(self) -> str:
         """The messages that the newest trial lacks, in words; empty where it is complete."""
-        return self._segments[-1].lacks()
+        return self._builders[-1].lacks()
 
     @property
     def problems(self) -> tuple[InputError, ...]:
@@ -141,18 +141,18 @@ class TrialCollector:
 
         They include those that later messages caused, but not those that `take_news` returns.
         """
-        found = [error for segment in self._segments for _, error in segment.refused]
-        for segment, following in pairwise(self._segments[1:]):
-            found += _cut_off(segment, f'and {following.starts[0]}',
+        found = [error for builder in self._builders for _, error in builder.refused]
+        for builder, following in pairwise(self._builders[1:]):
+            found += _cut_off(builder, f'and {following.starts[0]}',
                               'send no initial chain before the trial is complete')
         return tuple(found)
 
     @property
     def loose_end(self) -> tuple[InputError, ...]:
         """The reason why the newest trial is incomplete if no more messages come, if there is one."""
-        if len(self._segments) == 1:
+        if len(self._builders) == 1:
             return self._orphans()
-        return _cut_off(self._segments[-1], 'and the end', 'send all messages of a trial')
+        return _cut_off(self._builders[-1], 'and the end', 'send all messages of a trial')
 
     def take_news(self) -> tuple[InputError, ...]:
         """Return, once, the refusals of waiting messages since the last call."""
@@ -170,27 +170,27 @@ class TrialCollector:
                              'messages in about the order of their stamps', 'send it earlier, or reset')
         if key not in self._known:
             return
-        segment = self._segments[self._place(key)]
-        others = [(one, error) for one, error in segment.refused if order(one) != key]
-        if len(others) == len(segment.refused):
+        builder = self._builders[self._place(key)]
+        others = [(one, error) for one, error in builder.refused if order(one) != key]
+        if len(others) == len(builder.refused):
             raise InputError(str(message), f'a second {message.kind} with this stamp', 'one',
                              'stamp every message with its own time, or reset to begin anew')
-        segment.refused = others
+        builder.refused = others
         self._spare -= 1
 
     def _place(self, key: Key) -> int:
-        """Return the index of the segment to which a message belongs."""
-        return bisect_right(self._segments, key, key=lambda segment: segment.first) - 1
+        """Return the index of the builder to which a message belongs."""
+        return bisect_right(self._builders, key, key=lambda builder: builder.first) - 1
 
     def _insert(self, message: Message, key: Key) -> InputError | None:
         """Take a message that is earlier than another; return the reason if it is not used."""
         begin = end = self._place(key)
         waiting, folded, found = [message], list[TrialBuilder](), None
-        # Further segments change only until an initial chain begins the next trial.
-        while end < len(self._segments) and not (end > begin and folded[-1].busy):
-            waiting = sorted([*waiting, *self._segments[end].messages()], key=order)
+        # Further builders change only until an initial chain begins the next trial.
+        while end < len(self._builders) and not (end > begin and folded[-1].busy):
+            waiting = sorted([*waiting, *self._builders[end].messages()], key=order)
             if not folded:
-                folded.append(TrialBuilder(self._segments[begin].first))
+                folded.append(TrialBuilder(self._builders[begin].first))
             for one in waiting:
                 orphans = begin == 0 and len(folded) == 1
                 if one.kind == INITIAL and folded[-1].busy and (folded[-1].starts or orphans):
@@ -200,14 +200,14 @@ class TrialCollector:
                     found = error
             waiting = []
             end += 1
-        self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._segments[begin:end])
-        self._segments[begin:end] = folded
-        if begin == 0 and len(self._segments) > 1 and order(message) < self._segments[1].first:
+        self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._builders[begin:end])
+        self._builders[begin:end] = folded
+        if begin == 0 and len(self._builders) > 1 and order(message) < self._builders[1].first:
             return self._no_start(message)
         return found
 
     def _no_start(self, message: Message, more: int = 0) -> InputError:
-        first = f'the first is {self._segments[1].starts[0]}' if len(self._segments) > 1 else 'there is none'
+        first = f'the first is {self._builders[1].starts[0]}' if len(self._builders) > 1 else 'there is none'
         return InputError(
             f'{message} and {more} more' if more else str(message),
             f'no initial_chain before {"them" if more else "it"}', f'one stamped earlier ({first})',
@@ -215,45 +215,45 @@ class TrialCollector:
 
     def _orphans(self) -> tuple[InputError, ...]:
         """Return one refusal for all messages before the first initial chain, if there are any."""
-        waiting = sorted(self._segments[0].waiting, key=order)
+        waiting = sorted(self._builders[0].waiting, key=order)
         return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
     def _forget(self) -> None:
         """Forget the oldest messages that no trial uses, until half of KEPT are left."""
         surplus = self._spare - KEPT // 2
         kept: list[TrialBuilder] = []
-        for segment, following in zip(self._segments, [*self._segments[1:], None], strict=True):
-            before = segment.spare
+        for builder, following in zip(self._builders, [*self._builders[1:], None], strict=True):
+            before = builder.spare
             if surplus <= 0:
-                kept.append(segment)
-            elif segment.starts and not segment.complete and following is not None:
-                self._drop(segment.messages())
-                self._close(segment.first, following.first)
+                kept.append(builder)
+            elif builder.starts and not builder.complete and following is not None:
+                self._drop(builder.messages())
+                self._close(builder.first, following.first)
                 surplus -= before
             else:
-                self._trim(segment, surplus)
-                surplus -= before - segment.spare
-                kept.append(segment)
-        self._segments = kept
-        self._spare = sum(segment.spare for segment in kept)
+                self._trim(builder, surplus)
+                surplus -= before - builder.spare
+                kept.append(builder)
+        self._builders = kept
+        self._spare = sum(builder.spare for builder in kept)
 
-    def _trim(self, segment: TrialBuilder, surplus: int) -> None:
-        """Forget the oldest spare messages of a segment that stays."""
-        count = min(surplus, len(segment.starts) - 2)
+    def _trim(self, builder: TrialBuilder, surplus: int) -> None:
+        """Forget the oldest spare messages of a builder that stays."""
+        count = min(surplus, len(builder.starts) - 2)
         if count > 0:
             surplus -= count
-            self._drop(segment.starts[:count])
-            del segment.starts[:count]
-            self._close(segment.first, order(segment.starts[0]))
-            segment.first = order(segment.starts[0])
-            early = sum(order(message) < segment.first for message, _ in segment.refused)
+            self._drop(builder.starts[:count])
+            del builder.starts[:count]
+            self._close(builder.first, order(builder.starts[0]))
+            builder.first = order(builder.starts[0])
+            early = sum(order(message) < builder.first for message, _ in builder.refused)
             surplus = max(surplus, early)
-        count = max(min(surplus, len(segment.refused)), 0)
-        self._drop(message for message, _ in segment.refused[:count])
-        del segment.refused[:count]
-        count = max(min(surplus - count, len(segment.waiting)), 0)
-        self._drop(segment.waiting[:count])
-        del segment.waiting[:count]
+        count = max(min(surplus, len(builder.refused)), 0)
+        self._drop(message for message, _ in builder.refused[:count])
+        del builder.refused[:count]
+        count = max(min(surplus - count, len(builder.waiting)), 0)
+        self._drop(builder.waiting[:count])
+        del builder.waiting[:count]
 
     def _drop(self, messages: Iterable[Message]) -> None:
         for message in messages:
@@ -271,12 +271,12 @@ class TrialCollector:
         self._forgotten = merged
 
 
-def _cut_off(segment: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:
-    """Return why a finished segment is no trial, if it has more than initial chains."""
-    if segment.complete or not (segment.moves or segment.waiting):
+def _cut_off(builder: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:
+    """Return why a finished builder is no trial, if it has more than initial chains."""
+    if builder.complete or not (builder.moves or builder.waiting):
         return ()
-    if segment.moves:
-        came = f'no goal_chain between {segment.moves[0].message} {until}'
+    if builder.moves:
+        came = f'no goal_chain between {builder.moves[0].message} {until}'
     else:
-        came = f'{len(segment.waiting)} goal_chain, but no action between {segment.starts[-1]} {until}'
-    return InputError(f'trial that begins with {segment.starts[-1]}', came, 'at least one', remedy),
+        came = f'{len(builder.waiting)} goal_chain, but no action between {builder.starts[-1]} {until}'
+    return InputError(f'trial that begins with {builder.starts[-1]}', came, 'at least one', remedy),

@@ -51,9 +51,9 @@ class GoalView:
 @dataclass
 class TrialBuilder:
     """
-    A segment: the messages of one trial, complete or not.
+    The messages of one trial, complete or not.
 
-    The first segment of a collector has no initial chain: it holds the messages before the first one.
+    The first builder of a collector has no initial chain: it holds the messages before the first one.
     `extend` takes messages in their order only.
 
     :param first: key of the first initial chain.
@@ -87,7 +87,7 @@ class TrialBuilder:
         return max(len(self.starts) - 2, 0) + len(self.waiting) + len(self.refused)
 
     def messages(self) -> list[Message]:
-        """Return all messages of the segment, in order."""
+        """Return all messages of the trial, in order."""
         return sorted([*self.starts, *(one.message for one in self.moves), *self.waiting,
                        *(one.message for one in self.views),
                        *(message for message, _ in self.refused)], key=order)
@@ -169,7 +169,7 @@ class TrialBuilder:
         return GoalView(goal, latest.names, bool(finished) and not under_way, held_by)
 
     def build(self, name: str) -> Trial:
-        """Return the trial of a complete segment; the same object until a message changes it."""
+        """Return the trial once it is complete; the same object until a message changes it."""
         if self.trial is None:
             self.trial = self._build(name)
         elif self.trial.name != name:

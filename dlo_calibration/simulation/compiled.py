@@ -49,7 +49,7 @@ class CompiledRope(Rope):
 
 
 class CompiledSimulator(Engine):
-    """Simulates trials on a table or in the air, about thirty times as fast as `bullet.BulletSimulator`."""
+    """Simulates trials on a table or in the air, 20 to 30 times as fast as `bullet.BulletSimulator`."""
 
     name = 'compiled'
 
