@@ -91,4 +91,5 @@ $(STAMP): setup.py
 	  echo 'PyBullet has no binary for this Python: it is compiled now, which takes about four minutes more.'
 	fi
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable $(REQUIREMENTS)
+	$(PYTHON) -c 'import dlo_calibration.simulation.kernels'  # compiles them, once for all processes of a test
 	touch $@
