@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help demo experiment test lint bench figures clean
+.PHONY: help demo experiment test lint bench soak figures clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -36,6 +36,7 @@ help:
 	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
+	  make soak    try hostile input and faults for up to an hour, and print what was lost and what died
 	  make figures make all tables of benchmark/results: make bench, and then some hours
 	  make clean   remove .venv and everything that was built
 	END
@@ -59,6 +60,9 @@ bench: $(STAMP)
 	$(PYTHON) benchmark/agreement.py
 	for name in $(if $(MEASURED),estimates discretisation accuracy); do $(PYTHON) benchmark/$$name.py; done
 	$(if $(MEASURED),,echo 'DLO_DATA names no folder: the tables of measured objects are not made again.')
+
+soak: $(STAMP)
+	@$(PYTHON) test/soak/soak.py | tee benchmark/results/soak.md
 
 figures: bench
 	@$(PYTHON) benchmark/searches.py
