@@ -40,5 +40,5 @@ class SimulationError(DloCalibrationError):
 
 def unwritable(path: object, error: OSError, kind: str = 'file') -> InputError:
     """Return the error for a file, or another `kind` of path, that cannot be written."""
-    return InputError(f'{kind} {path}', str(error), 'a place that can be written to',
+    return InputError(f'{kind} {path}', error.strerror or str(error), 'a place that can be written to',
                       'choose another one with --output')

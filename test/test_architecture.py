@@ -20,7 +20,7 @@ FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 ROOMS = ('model', 'observation', 'simulation', 'evaluation', 'search', 'inference', 'calibration', 'planning',
          'messages', 'files', 'capture', 'export', 'report', 'experiment', 'ros', 'cli')
 #: Modules outside the rooms, which every room may import.
-SHARED = ('errors', 'signals')
+SHARED = ('errors', 'signals', 'writing')
 
 #: Where in the package something may be imported, be it at the top of a module or inside a function.
 ONLY = {

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 import shutil
 import sys
-from typing import Callable, Sequence
+from typing import Callable
 
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.engines import SimulatorFactory
@@ -18,12 +18,13 @@ from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.cli.options import given_options
 from dlo_calibration.cli.output import print_result, tell
 from dlo_calibration.cli.source import add_source, read_source, Source
-from dlo_calibration.errors import SimulationError, unwritable
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.files.session import trial_records
 from dlo_calibration.signals import StopFlag
+from dlo_calibration.writing import Attempts, make_folder, whole
 
 TEXT = 'find the parameters that explain a session best'
 # Names of the files in the output folder.
@@ -48,7 +49,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         folder = Path(source.options.output_directory)
     files = [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
     if folder is not None:
-        _make_folder(folder, files)
+        make_folder(folder)  # before hours are spent on a search
     told: list[str] = []
 
     def warn_once(text: str) -> None:
@@ -67,41 +68,39 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
                     raise
                 raise KeyboardInterrupt from None
         try:
-            if folder is not None:
-                _write_files(folder, source, result, make_simulator, stop)
-                tell(f'{", ".join(files)} are in {folder}')
-        finally:  # print the result even if the disk is full
+            attempts = None if folder is None else _write_files(folder, source, result, make_simulator, stop)
+        finally:  # whatever the disk does
             print_result(result, chosen.json, told)
+        if attempts is not None:
+            attempts.require()
+            tell(f'{", ".join(files)} are in {folder}')
     return 0
 
 
-def _make_folder(folder: Path, names: Sequence[str]) -> None:
-    """Make the folder, and check that these files can be written, before hours are spent on a search."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in names:
-            with (folder / name).open('ab'):
-                pass
-    except OSError as error:
-        raise unwritable(folder, error, 'folder') from error
-
-
 def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,
-                 should_stop: Callable[[], bool]) -> None:
-    """Write a result, and the session or request that it was found from, to a folder."""
+                 should_stop: Callable[[], bool]) -> Attempts:
+    """Write a result, and the session or request that it was found from, to a folder, as far as possible."""
     from dlo_calibration.report.page import digests, Origin, repeating_command, write_report
 
-    write_result(folder / RESULT, result, source.options.flat())
-    _write_session(folder / SESSION, source)
+    attempts = Attempts(folder)
+    with attempts.attempt(RESULT):
+        write_result(folder / RESULT, result, source.options.flat())
+    with attempts.attempt(SESSION):
+        _write_session(folder / SESSION, source)
     if source.is_request:
-        _copy(source.path, folder / REQUEST)
-    write_evaluations(folder / EVALUATIONS, result)
-    repeated = REQUEST if source.is_request else SESSION
-    origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
-                    digests([*_recorded(source.path), folder / repeated]),
-                    [*source.session.problems, *source.refusals])
-    slices = sliced(result, source.options, make_simulator, should_stop)
-    write_report(folder / REPORT, result, origin, slices)
+        with attempts.attempt(REQUEST):
+            _copy(source.path, folder / REQUEST)
+    with attempts.attempt(EVALUATIONS):
+        write_evaluations(folder / EVALUATIONS, result)
+    with attempts.attempt(REPORT):
+        repeated = REQUEST if source.is_request else SESSION
+        repeatable = [folder / repeated] if repeated in attempts.written else []
+        origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
+                        digests([*_recorded(source.path), *repeatable]),
+                        [*source.session.problems, *source.refusals])
+        slices = sliced(result, source.options, make_simulator, should_stop)
+        write_report(folder / REPORT, result, origin, slices)
+    return attempts
 
 
 def _recorded(path: Path) -> list[Path]:
@@ -117,23 +116,19 @@ def _write_session(path: Path, source: Source) -> None:
     For a request, write the messages that a robot would have sent.
     """
     files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
-    try:
-        if len(files) == 1 and files[0].suffix == '.mcap':
-            _copy(files[0], path)
-            return
-        records, options = source.session.records, source.session.recorded
-        if source.is_request:
-            records, options = trial_records(source.trials), source.options.flat()
-        writer = SessionWriter(path.with_name(f'{path.name}.new'), options)
-        with writer:
-            for record in records:
-                writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
-        writer.file.replace(path)
-        shutil.rmtree(writer.path)
-    except OSError as error:
-        raise unwritable(path, error) from error
+    if len(files) == 1 and files[0].suffix == '.mcap':
+        _copy(files[0], path)
+        return
+    records, options = source.session.records, source.session.recorded
+    if source.is_request:
+        records, options = trial_records(source.trials), source.options.flat()
+    with whole(path) as new, SessionWriter(new, options) as writer:
+        for record in records:
+            writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
 
 
 def _copy(source: Path, target: Path) -> None:
-    if not (target.exists() and target.samefile(source)):
-        shutil.copyfile(source, target)
+    """Copy a file, unless it is there already."""
+    if target.is_symlink() or not (target.exists() and target.samefile(source)):
+        with whole(target) as new:
+            shutil.copyfile(source, new)

@@ -14,7 +14,7 @@ import time
 from typing import Callable, Iterator, Sequence, TextIO
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.errors import InputError, unwritable
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.journal import Journal
@@ -24,6 +24,7 @@ from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.terminal import TaskBar
 from dlo_calibration.search import SEARCHES
+from dlo_calibration.writing import make_folder, whole
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,7 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     :returns: None if no run is complete.
     :raises InputError: if `folder` cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error, 'folder') from error
+    make_folder(folder)
     journal = Journal(folder / 'calibrations.jsonl')
     engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
     wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
@@ -162,7 +160,5 @@ def _draw(group: Sequence[tuple[Task, Outcome]], folder: Path, make_simulator: S
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with whole(path) as new:
+        new.write_text(text, encoding='utf-8')

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dlo_calibration.calibration.plain import evaluation_rows
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import unwritable
+from dlo_calibration.writing import whole
 
 
 def write_evaluations(path: Path, result: CalibrationResult) -> None:
@@ -20,8 +20,5 @@ def write_evaluations(path: Path, result: CalibrationResult) -> None:
     :raises InputError: where the file cannot be written.
     """
     head, rows = evaluation_rows(result)
-    try:
-        with path.open('w', newline='', encoding='utf-8') as stream:
-            csv.writer(stream).writerows([head, *rows])
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with whole(path) as new, new.open('w', newline='', encoding='utf-8') as stream:
+        csv.writer(stream).writerows([head, *rows])

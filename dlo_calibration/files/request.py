@@ -173,7 +173,7 @@ def write_request(path: str | Path, request: Request) -> None:
 
     :raises InputError: where the file cannot be written.
     """
-    write_octets(path, request.document, WHAT)
+    write_octets(path, request.document)
 
 
 def read_request(path: str | Path) -> Request:

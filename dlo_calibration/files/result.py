@@ -148,7 +148,7 @@ def write_result(path: str | Path, result: CalibrationResult | Description,
 
     :raises InputError: where the file cannot be written.
     """
-    write_octets(path, description_document(result, options), WHAT)
+    write_octets(path, description_document(result, options))
 
 
 def read_result(path: str | Path) -> Description:

@@ -28,6 +28,7 @@ from dlo_calibration.calibration.options import Declaration, declarations, Optio
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import exact
+from dlo_calibration.writing import whole
 
 MAXIMUM_SIZE = 64 * 2**20  # bytes; far above any real request, and small enough for the memory
 MAXIMUM_ELEMENTS = 1_000_000  # likewise
@@ -92,17 +93,14 @@ def document(root: Any) -> bytes:
     return bytes(etree.tostring(root, xml_declaration=True, encoding='UTF-8')) + b'\n'
 
 
-def write_octets(path: str | Path, octets: bytes, what: str) -> None:
+def write_octets(path: str | Path, octets: bytes) -> None:
     """
     Write a document to a file.
 
     :raises InputError: where the file cannot be written.
     """
-    try:
-        Path(path).write_bytes(octets)
-    except OSError as error:
-        raise InputError(f'{what} {path}', str(error), 'a place that can be written to',
-                         'choose another output directory') from error
+    with whole(Path(path)) as new:
+        new.write_bytes(octets)
 
 
 def refused(where: str, element: Any, came: str, expected: str,

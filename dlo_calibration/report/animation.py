@@ -11,13 +11,13 @@ from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.errors import unwritable
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.quantity import number
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.report.drawing import hand_colours, numbered, View
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.protocol import Simulator
+from dlo_calibration.writing import whole
 
 FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
@@ -79,18 +79,15 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
 
     speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
     writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': f'{trial.name}, simulated'})
-    try:
-        with settings():
-            scene = _Scene(trial, motion, speed)
-            with writer.saving(scene.figure, str(path), dpi=DOTS_PER_INCH):
-                for time, chain in zip(motion.times, motion.chains, strict=True):
-                    scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
-                    writer.grab_frame()
-                scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
-                for _ in range(round(1.6 * FRAME_RATE)):  # a pause, to look at the end
-                    writer.grab_frame()
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with whole(Path(path)) as new, settings():
+        scene = _Scene(trial, motion, speed)
+        with writer.saving(scene.figure, str(new), dpi=DOTS_PER_INCH):
+            for time, chain in zip(motion.times, motion.chains, strict=True):
+                scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
+                writer.grab_frame()
+            scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
+            for _ in range(round(1.6 * FRAME_RATE)):  # a pause, to look at the end
+                writer.grab_frame()
 
 
 def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],

@@ -13,7 +13,6 @@ from typing import Callable, Mapping, Sequence, TYPE_CHECKING
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import unwritable
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Hand
@@ -40,6 +39,7 @@ from dlo_calibration.report.figure import (
     YELLOW,
 )
 from dlo_calibration.report.sentences import MEAN_DISTANCE
+from dlo_calibration.writing import make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,10 +132,7 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
 
 def numbered(trials: Sequence[Trial], folder: Path, suffix: str) -> list[Path]:
     """Return a path for each trial, numbered because names may contain anything; create the folder."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error) from error
+    make_folder(folder)
     return [folder / f'trial_{k}{suffix}' for k in range(1, len(trials) + 1)]
 
 

@@ -14,7 +14,7 @@ import textwrap
 import threading
 from typing import Any, Callable, Iterator, Sequence, TYPE_CHECKING
 
-from dlo_calibration.errors import unwritable
+from dlo_calibration.writing import whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,10 +94,8 @@ def write_figure(figure: Figure, path: str | Path) -> None:
 
     :raises InputError: if the file cannot be written.
     """
-    try:
-        figure.savefig(path, format='png', dpi=110)
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with whole(Path(path)) as new:
+        figure.savefig(new, format='png', dpi=110)
 
 
 def add_legend(figure: FigureBase, axes: Sequence[Axes], columns: int = 4) -> None:

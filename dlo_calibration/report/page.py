@@ -16,7 +16,6 @@ from typing import Any, Iterable, Mapping, Sequence
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import unwritable
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME
@@ -26,6 +25,7 @@ from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
 from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences
 from dlo_calibration.report.terminal import fit_facts
+from dlo_calibration.writing import whole
 
 MOST_TRIALS = 12  # are drawn, so that the page stays small
 
@@ -98,10 +98,8 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
         changed=_changed(origin.options), defaults=Options().flat(), options=origin.options.flat(),
         declarations=list(declarations()))
-    try:
-        path.write_text(page, encoding='utf-8')
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with whole(path) as new:
+        new.write_text(page, encoding='utf-8')
 
 
 def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, float | None]:

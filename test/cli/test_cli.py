@@ -4,12 +4,14 @@
 """The command line: what it prints, where, and how it ends."""
 
 import csv
+import errno
 import hashlib
 import html
 import json
 import os
 from pathlib import Path
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -155,6 +157,39 @@ def test_fit_prints_what_it_found_where_the_disk_is_full_by_then(run, session, t
     assert code == 2
     assert 'No space left on device' in errors
     assert only_json(output)['evaluations'] == 3
+
+
+def test_files_that_fail_prevent_no_other_and_old_ones_stay(run, session, tmp_path, monkeypatch):
+    folder = tmp_path / 'out'
+    assert run('fit', session, '--output', folder, '--evaluations', 2)[0] == 0
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    (folder / 'evaluations.csv').unlink()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, 'copyfile', full)
+        patch.setattr('dlo_calibration.files.evaluations.csv.writer', full)
+        code, output, errors = run('fit', session, '--json', '--output', folder, '--evaluations', 3)
+    assert code == 2
+    assert only_json(output)['evaluations'] == 3
+    last = errors.splitlines()[-1]
+    assert 'session.mcap (an older one is there), evaluations.csv: No space left on device' in last
+    assert 'result.xml, report.html could be' in last
+    assert read_result(folder / 'result.xml').evaluations == 3
+    assert (folder / 'session.mcap').read_bytes() == before['session.mcap']
+    assert {file.name for file in folder.iterdir()} == {'result.xml', 'session.mcap', 'report.html'}
+
+
+def test_an_interrupt_before_the_first_evaluation_leaves_no_files(run, session, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit, 'calibrate', interrupted)
+    code, _, errors = run('fit', session, '--output', tmp_path / 'out')
+    assert (code, errors) == (130, 'dlo-calibration: interrupted\n')
+    assert [path for path in (tmp_path / 'out').iterdir() if path.suffix != '.mcap'] == []
 
 
 def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):

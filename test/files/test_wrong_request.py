@@ -241,23 +241,21 @@ def test_folder_that_goes_away_is_told_and_the_calibration_goes_on(ros_environme
 @pytest.mark.parametrize('name', ['result.xml', 'session.mcap', 'report.html', 'evaluations.csv'])
 def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, command, monkeypatch, name):
     path = write_session(tmp_path / 'session', GOOD, QUICK)
-    write_text, write_bytes, copyfile, fopen = Path.write_text, Path.write_bytes, shutil.copyfile, Path.open
+    done, replace = [], os.replace
 
-    def refuse(where, *_):
+    def refuse(new, where):
         if Path(where).name == name and done:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(where))
+        replace(new, where)
 
-    done = []
-    monkeypatch.setattr(Path, 'write_text', lambda p, *a, **k: refuse(p) or write_text(p, *a, **k))
-    monkeypatch.setattr(Path, 'write_bytes', lambda p, *a, **k: refuse(p) or write_bytes(p, *a, **k))
-    monkeypatch.setattr(Path, 'open', lambda p, *a, **k: refuse(p) or fopen(p, *a, **k))
-    monkeypatch.setattr(shutil, 'copyfile', lambda a, b: refuse(b) or copyfile(a, b))
+    monkeypatch.setattr(os, 'replace', refuse)
     monkeypatch.setattr(fit, 'calibrate',
                         lambda *args, **rest: done.append(1) or calibrate(*args, **rest))
     code, result, errors = command('fit', path, '--json', '--output', tmp_path / 'out')
     assert (code, result['trials']) == (2, 2)
     error, = errors
-    assert name in error and os.strerror(errno.ENOSPC) in error
+    assert f'could not be written: {name}: {os.strerror(errno.ENOSPC)}; ' in error
+    assert name not in {file.name for file in (tmp_path / 'out').iterdir()}
 
 
 # ---- killed and damaged

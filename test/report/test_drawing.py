@@ -5,6 +5,8 @@
 
 from dataclasses import replace
 import io
+from pathlib import Path
+import tempfile
 
 import numpy as np
 from PIL import Image, ImageColor
@@ -34,9 +36,10 @@ def tracked(count):
 
 def trial_png(trial, chains):
     """Return the picture as the bytes of a PNG."""
-    buffer = io.BytesIO()
-    session_picture([trial], None if chains is None else [chains], buffer)
-    return buffer.getvalue()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'trial.png'
+        session_picture([trial], None if chains is None else [chains], path)
+        return path.read_bytes()
 
 
 def pixels(trial, chains):

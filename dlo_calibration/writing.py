@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Writing: files that are whole or not there at all, whatever happens to the disk or the process."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager, suppress
+import errno
+import os
+from pathlib import Path
+import secrets
+import stat
+from typing import Iterator
+
+from dlo_calibration.errors import DloCalibrationError, InputError, unwritable
+
+_unfinished: set[Path] = set()  # files that are being written
+
+
+@contextmanager
+def _temporary(folder: Path, suffix: str = '') -> Iterator[Path]:
+    """Give a path at which a file may be made, and remove that file when the block ends."""
+    path = folder / f'.unfinished_{secrets.token_hex(8)}{suffix}'  # nobody else can know it
+    _unfinished.add(path)
+    try:
+        yield path
+    finally:
+        with suppress(OSError):
+            os.unlink(path)
+        _unfinished.discard(path)
+
+
+@contextmanager
+def replacing(path: Path, fsync: bool = True) -> Iterator[Path]:
+    """
+    Give the path of a new file, which takes the place of `path` when the block ends without an error.
+
+    After an error, `path` is as before, and nothing else is left.  A link at `path` is replaced, not
+    followed; anything else there that is no file is refused.
+
+    :param fsync: False: do not wait for the disk.  A power failure may then cost the file.
+    :raises OSError: where the file cannot be written.
+    """
+    with suppress(FileNotFoundError):
+        kind = os.lstat(path).st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISLNK(kind)):
+            raise OSError(errno.EEXIST, 'something that is no file has this name')
+    with _temporary(path.parent, path.suffix) as new:
+        yield new
+        if fsync:  # some file systems tell only now that they are full
+            descriptor = os.open(new, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        os.replace(new, path)
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """
+    Do what `replacing` does, with errors for users.
+
+    :raises InputError: where the file cannot be written.
+    """
+    try:
+        with replacing(path) as new:
+            yield new
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def remove_unfinished() -> None:
+    """Remove the files that are being written; for a process that ends now."""
+    for path in list(_unfinished):
+        with suppress(OSError):
+            os.unlink(path)
+
+
+def make_folder(folder: Path) -> None:
+    """
+    Make a folder, with its parents, and check that a file can be written there.
+
+    :raises InputError: where that is not possible.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _temporary(folder) as new:
+            new.write_bytes(b'?')  # a full disk may still make a file without content
+    except OSError as error:
+        raise unwritable(folder, error, 'folder') from error
+
+
+class Attempts:
+    """
+    Files that are written one after the other, where one that fails does not prevent the next.
+
+    :param folder: where they belong.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.written: list[str] = []
+        self._failed: dict[str, str] = {}
+
+    @contextmanager
+    def attempt(self, name: str) -> Iterator[None]:
+        """Write one file in this block; its error is kept, and not raised."""
+        try:
+            yield
+        except (DloCalibrationError, OSError) as error:
+            self.fail(name, _reason(error))
+        else:
+            self.written.append(name)
+
+    def fail(self, name: str, why: str) -> None:
+        """Note that a file could not be written."""
+        self._failed[name] = why
+
+    @property
+    def failure(self) -> str:
+        """What could not be written and why, as a part of a sentence; empty if all could be."""
+        if not self._failed:
+            return ''
+        names = [f'{name} (an older one is there)' if (self.folder / name).exists() else name
+                 for name in self._failed]
+        return f'{", ".join(names)}: {"; ".join(dict.fromkeys(self._failed.values()))}'
+
+    def require(self) -> None:
+        """
+        Do nothing if all files were written.
+
+        :raises DloCalibrationError: if not; it names those that were not written, and those that were.
+        """
+        if self._failed:
+            there = f'; {", ".join(self.written)} could be' if self.written else ''
+            raise DloCalibrationError(f'folder {self.folder}: could not be written: {self.failure}{there}; '
+                                      'make room, or choose another folder, and repeat the command')
+
+
+def _reason(error: Exception) -> str:
+    """Return why something could not be written, without names that a user need not know."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return error.came if isinstance(error, InputError) else ' '.join(str(error).split())
