@@ -86,7 +86,7 @@ setup(
     entry_points={
         'console_scripts': [
             f'calibrator = {NAME}.ros.calibrator:main',
-            f'dlo-calibration = {NAME}.cli.main:main',
+            f'dlo-calibration = {NAME}.__main__:main',
         ],
     },
 )

@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from dlo_calibration.cli import demo
+from dlo_calibration.cli import conversation
 from dlo_calibration.files.session import read_session  # noqa: E402
 from dlo_calibration.ros import calibrator_node  # noqa: E402 - where there is a ROS
 from dlo_calibration.signals import StopFlag  # noqa: E402
@@ -53,9 +53,9 @@ def running_node(folder, **options):
         child = subprocess.Popen([sys.executable, __file__, str(folder / 'fired'), '--ros-args', *words],
                                  stdout=log, stderr=subprocess.STDOUT)
     try:
-        with demo._robot(child, folder / 'log', lambda: False) as robot:
+        with conversation._robot(child, folder / 'log', lambda: False) as robot:
             yield robot
-        child.send_signal(demo.signal.SIGINT)
+        child.send_signal(conversation.signal.SIGINT)
         assert child.wait(60) == 0
     finally:
         child.kill()
@@ -67,7 +67,7 @@ def round_trips(robot):
     from rcl_interfaces.srv import GetParameters
     import rclpy
 
-    client = robot._node.create_client(GetParameters, f'{demo.NODE}/get_parameters')
+    client = robot._node.create_client(GetParameters, f'{conversation.NODE}/get_parameters')
     assert client.wait_for_service(60)
     request, found = GetParameters.Request(names=['evaluations']), []
     for _ in range(CALLS):
@@ -96,7 +96,7 @@ def rows():
 @pytest.mark.parametrize('engine', ['none', 'compiled', 'bullet'])
 def test_the_node_answers_while_it_calibrates(engine, rows, tmp_path, monkeypatch):
     """Measure the node; without a calibration if the engine is `none`."""
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % demo.LAST_DOMAIN))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % conversation.LAST_DOMAIN))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros'))
     with running_node(tmp_path, engine='auto' if engine == 'none' else engine, search='random',

@@ -1,11 +1,28 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the command line as `python -m dlo_calibration`."""
+"""The executable `dlo-calibration`, which handles signals before it loads anything large."""
 
+import os
 import sys
 
-from dlo_calibration.cli.main import main
+from dlo_calibration.signals import end_at_signals, StopFlag
+
+
+def main() -> int:
+    """Execute the command line of the process; return the exit code, as `cli.main.main` does."""
+    end_at_signals('dlo-calibration')
+    # Where they were closed by whoever started the process, Python has none.
+    sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
+    from dlo_calibration.cli.main import main as execute
+    from dlo_calibration.cli.output import flush
+
+    try:
+        return execute()
+    finally:
+        flush()
+        StopFlag().ignore()  # what there was to do is done
+
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -1,16 +1,54 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals: SIGINT and SIGTERM set a flag instead of interrupting the program."""
+"""
+Signals: SIGINT and SIGTERM end the program with one line, or set a flag.
+
+Neither raises KeyboardInterrupt, which other libraries may take for an error of their own, and which
+shows a traceback where nobody expects it.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from types import FrameType
-from typing import Any
+from typing import Any, Callable
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from Ctrl-C; from `kill` and `ros2 launch`
+
+
+_cleaners: list[Callable[[], None]] = []
+
+
+def before_end(clean: Callable[[], None]) -> None:
+    """Have `clean` called when a signal ends the process."""
+    _cleaners.append(clean)
+
+
+def end_at_signals(program: str) -> None:
+    """
+    From now on, let a signal end the process at once, with a line on stderr and `exit_code`.
+
+    Child processes that simulate end with this one.
+    """
+    def end(number: int, frame: FrameType | None) -> None:
+        for clean in _cleaners:
+            clean()
+        try:
+            os.write(2, f'{program}: interrupted\n'.encode())  # sys.stderr may be in use at this moment
+        except OSError:
+            pass  # nobody listens
+        os._exit(exit_code(number))
+
+    for one in SIGNALS:
+        signal.signal(one, end)
+
+
+def exit_code(number: int) -> int:
+    """Return the exit code of a program that a signal ended, by the shells' convention."""
+    return 128 + number
 
 
 class StopFlag:
@@ -18,12 +56,17 @@ class StopFlag:
 
     def __init__(self) -> None:
         # Not a threading.Event: its lock may be held by the code that the handler interrupts.
-        self._raised = False
+        self._number = 0
         self._before: dict[signal.Signals, Any] = {}
 
     def __call__(self) -> bool:
         """Tell whether a signal has arrived."""
-        return self._raised
+        return self._number > 0
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of a program that has nothing to report after the signal."""
+        return exit_code(self._number)
 
     def listen(self) -> None:
         """Handle the signals from now on; only the main thread can, so this does nothing elsewhere."""
@@ -51,4 +94,4 @@ class StopFlag:
                 signal.signal(number, handler)  # type: ignore[arg-type]
 
     def _raise(self, number: int, frame: FrameType | None) -> None:
-        self._raised = True
+        self._number = number

@@ -9,19 +9,29 @@ from contextlib import contextmanager, suppress
 import errno
 import os
 from pathlib import Path
-import secrets
 import stat
 from typing import Iterator
 
 from dlo_calibration.errors import DloCalibrationError, InputError, unwritable
+from dlo_calibration.signals import before_end
 
 _unfinished: set[Path] = set()  # files that are being written
+
+
+def remove_unfinished() -> None:
+    """Remove the files that are being written; for a process that ends now."""
+    for path in list(_unfinished):
+        with suppress(OSError):
+            os.unlink(path)
+
+
+before_end(remove_unfinished)
 
 
 @contextmanager
 def _temporary(folder: Path, suffix: str = '') -> Iterator[Path]:
     """Give a path at which a file may be made, and remove that file when the block ends."""
-    path = folder / f'.unfinished_{secrets.token_hex(8)}{suffix}'  # nobody else can know it
+    path = folder / f'.unfinished_{os.urandom(8).hex()}{suffix}'  # nobody else can know it
     _unfinished.add(path)
     try:
         yield path
@@ -69,13 +79,6 @@ def whole(path: Path) -> Iterator[Path]:
             yield new
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-def remove_unfinished() -> None:
-    """Remove the files that are being written; for a process that ends now."""
-    for path in list(_unfinished):
-        with suppress(OSError):
-            os.unlink(path)
 
 
 def make_folder(folder: Path) -> None:

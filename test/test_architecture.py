@@ -24,7 +24,7 @@ SHARED = ('errors', 'signals', 'writing')
 
 #: Where in the package something may be imported, be it at the top of a module or inside a function.
 ONLY = {
-    'rclpy': ('ros', 'cli/demo.py'),  # the demo stands for the robot, on the other side of the graph
+    'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
     'pybullet': ('simulation/bullet.py',),
     'numba': ('simulation/kernels.py',),
     'cma': ('search/cma_es.py',),

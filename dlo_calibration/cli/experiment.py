@@ -14,7 +14,7 @@ from typing import Any, Mapping, Sequence
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import MACHINE, names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.cli.output import INTERRUPTED, print_json, tell
+from dlo_calibration.cli.output import print_json, standard_output, tell
 from dlo_calibration.cli.source import add_common_arguments, read_source
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment import tables
@@ -59,14 +59,17 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     plan = _plan(chosen)
     with StopFlag() as stop:
-        account = conduct(plan, chosen.output, make_simulator, stop, tell, sys.stderr)
+        account, attempts = conduct(plan, chosen.output, make_simulator, stop, tell, sys.stderr)
     if account is None:
-        raise KeyboardInterrupt
+        attempts.require()
+        raise KeyboardInterrupt(stop.exit_code)
     if chosen.json:
-        print_json(tables.document(account), sys.stdout)
+        print_json(tables.document(account))
     else:
-        sys.stdout.write(tables.markdown(account))
-    return 0 if account.complete else INTERRUPTED
+        with standard_output() as stream:
+            stream.write(tables.markdown(account))
+    attempts.require()
+    return 0 if account.complete else stop.exit_code
 
 
 def _plan(chosen: argparse.Namespace) -> Plan:

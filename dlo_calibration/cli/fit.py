@@ -66,7 +66,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             except SimulationError:
                 if not stop():
                     raise
-                raise KeyboardInterrupt from None
+                raise KeyboardInterrupt(stop.exit_code) from None
         try:
             attempts = None if folder is None else _write_files(folder, source, result, make_simulator, stop)
         finally:  # whatever the disk does

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-import sys
 from typing import Any
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.cli.output import print_json
+from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.model.trial import Trial
 
@@ -25,9 +24,10 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
     about = _about(read_source(chosen, lambda text: None))
     if chosen.json:
-        print_json(about, sys.stdout)
+        print_json(about)
     else:
-        terminal.print_info(about, sys.stdout)
+        with standard_output() as stream:
+            terminal.print_info(about, stream)
     return 0
 
 

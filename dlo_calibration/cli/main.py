@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 import argparse
+from signal import SIGINT
 import sys
 from typing import NoReturn, Sequence
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli import experiment, fit, info, plot, validate
-from dlo_calibration.cli.output import INTERRUPTED
+from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.signals import exit_code
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 #: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
@@ -25,19 +27,20 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
     Execute a command line.
 
     :param args: command line without the program's name; None: that of the process.
-    :returns: exit code: 0; 2, with one line on stderr, if an input cannot be used; 130 if Ctrl-C
-        arrived before there was anything to report, or before an experiment was complete.
+    :returns: exit code: 0; 2, with one line on stderr, if an input cannot be used or something cannot
+        be written; 130 or 143 if SIGINT (Ctrl-C) or SIGTERM arrived before there was anything to
+        report, or before an experiment was complete.
     """
     try:
         chosen = _parser().parse_args(args)
         code: int = chosen.act(chosen, make_simulator)
         return code
     except DloCalibrationError as error:
-        sys.stderr.write(f'{PROGRAM}: {" ".join(str(error).split())}\n')
+        tell(f'{PROGRAM}: {" ".join(str(error).split())}')
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write(f'{PROGRAM}: interrupted\n')
-        return INTERRUPTED
+    except KeyboardInterrupt as interrupt:
+        tell(f'{PROGRAM}: interrupted')
+        return int(interrupt.args[0]) if interrupt.args else exit_code(SIGINT)
     except BrokenPipeError:  # the reader of the pipe, such as `head`, has ended
         sys.stderr.close()
         return 0
@@ -59,7 +62,3 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(act=verb.act)
         verb.add_arguments(added)
     return parser
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 from contextlib import closing
 from pathlib import Path
-import sys
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, tell
@@ -50,5 +49,5 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             animations = write_animations(source.trials, simulator, physical, chosen.output, tell)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
-                    'animations': [str(path) for path in animations]}, sys.stdout)
+                    'animations': [str(path) for path in animations]})
     return 0

@@ -24,7 +24,9 @@ from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.report.drawing import session_picture
 from dlo_calibration.report.terminal import TaskBar
 from dlo_calibration.search import SEARCHES
-from dlo_calibration.writing import make_folder, whole
+from dlo_calibration.writing import Attempts, make_folder, whole
+
+JOURNAL = 'calibrations.jsonl'  # in the folder of an experiment
 
 
 @dataclass(frozen=True)
@@ -57,46 +59,41 @@ class Plan:
 
 
 def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
-            note: Callable[[str], None], stream: TextIO) -> tables.Account | None:
+            note: Callable[[str], None], stream: TextIO) -> tuple[tables.Account | None, Attempts]:
     """
     Perform the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
 
-    If it is stopped, tables and pictures show the runs that are complete.
+    If it is stopped, or outcomes can no longer be kept, tables and pictures show the runs that are complete.
 
     :param note: called with each sentence for the user.
     :param stream: for a progress bar.
-    :returns: None if no run is complete.
-    :raises InputError: if `folder` cannot be written.
+    :returns: what the tables show, None if no run is complete; and the files that could not be written.
+    :raises InputError: if `folder` cannot be made, or its journal cannot be read.
     """
     make_folder(folder)
-    journal = Journal(folder / 'calibrations.jsonl')
+    attempts, journal = Attempts(folder), Journal(folder / JOURNAL)
     engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
     wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
     _perform_all([task for task in wanted if journal.find(task) is None], len(wanted), plan.workers,
                  journal, make_simulator, stop, note, stream)
+    if journal.failure:
+        attempts.fail(f'the end of {JOURNAL}', journal.failure)
     done = [(task, outcome) for task in wanted if (outcome := journal.find(task)) is not None]
     groups = [group for subject in plan.subjects for search in plan.searches
               if complete_runs(group := [one for one in done if one[0].subject is subject
                                          and one[0].search == search])]
     if not groups:
-        return None
+        return None, attempts
     account = tables.Account(
         tuple(summary(group) for group in groups), plan.command, ', '.join(dict.fromkeys(engines.values())),
         plan.runs, plan.evaluations, plan.samples, complete=len(done) == len(wanted))
-    for name, text in (
-            ('experiment.md', tables.markdown(account)),
-            ('experiment.json', json.dumps(tables.document(account), indent=2, allow_nan=False) + '\n'),
-            ('consistency.csv', tables.consistency_csv(account)),
-            ('validity.csv', tables.validity_csv(account)), ('calibrations.csv', tables.runs_csv(done))):
-        _write(folder / name, text)
-    tables.scatter_picture(groups, folder / 'parameters.png')
-    for group in groups:
-        _draw(group, folder, make_simulator)
-    note(f'tables and pictures are in {folder}')
+    _write_all(account, groups, done, make_simulator, attempts)
+    if not attempts.failure:
+        note(f'tables and pictures are in {folder}')
     if not account.complete:
         note(f'interrupted: {len(done)} of {len(wanted)} calibrations are done; '
              'the same command continues with the others')
-    return account
+    return account, attempts
 
 
 def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
@@ -109,7 +106,7 @@ def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
 def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Journal,
                  make_simulator: SimulatorFactory, stop: Callable[[], bool], note: Callable[[str], None],
                  stream: TextIO) -> None:
-    """Perform tasks, each in one process, and add each outcome to the journal at once."""
+    """Perform tasks, each in one process, and add each outcome to the journal at once, until that fails."""
     if not waiting:
         return
     if len(waiting) < total:
@@ -119,6 +116,8 @@ def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Jou
         outcomes = _outcomes(waiting, min(workers or cores(), len(waiting)), make_simulator, stop, note)
         for count, (task, outcome) in enumerate(outcomes, start=1):
             journal.add(task, outcome)
+            if journal.failure:
+                return
             bar.advance()
             now = time.monotonic()
             if not bar.shown and now - told > 30.0:  # s, in a log file
@@ -145,7 +144,27 @@ def _outcomes(waiting: Sequence[Task], workers: int, make_simulator: SimulatorFa
                 yield futures.pop(future), future.result()
 
 
-def _draw(group: Sequence[tuple[Task, Outcome]], folder: Path, make_simulator: SimulatorFactory) -> None:
+def _write_all(account: tables.Account, groups: Sequence[Sequence[tuple[Task, Outcome]]],
+               done: Sequence[tuple[Task, Outcome]], make_simulator: SimulatorFactory, attempts: Attempts
+               ) -> None:
+    """Write tables and pictures."""
+    folder = attempts.folder
+    for name, text in (
+            ('experiment.md', tables.markdown(account)),
+            ('experiment.json', json.dumps(tables.document(account), indent=2, allow_nan=False) + '\n'),
+            ('consistency.csv', tables.consistency_csv(account)),
+            ('validity.csv', tables.validity_csv(account)), ('calibrations.csv', tables.runs_csv(done))):
+        with attempts.attempt(name), whole(folder / name) as new:
+            new.write_text(text, encoding='utf-8')
+    with attempts.attempt('parameters.png'):
+        tables.scatter_picture(groups, folder / 'parameters.png')
+    for group in groups:
+        name = f'{group[0][0].subject.name}_{group[0][0].search}.png'
+        with attempts.attempt(name):
+            _draw(group, folder / name, make_simulator)
+
+
+def _draw(group: Sequence[tuple[Task, Outcome]], path: Path, make_simulator: SimulatorFactory) -> None:
     """Draw the trials that judge a run, for the run with the median score."""
     scored = sorted(((score, found) for found in complete_runs(group)
                      if (score := run_score(found)) is not None), key=lambda one: one[0])
@@ -156,9 +175,4 @@ def _draw(group: Sequence[tuple[Task, Outcome]], folder: Path, make_simulator: S
              for one in judged_chains(task, outcome, make_simulator)]
     if shown:
         trials, chains = zip(*shown, strict=True)
-        session_picture(trials, chains, folder / f'{group[0][0].subject.name}_{group[0][0].search}.png')
-
-
-def _write(path: Path, text: str) -> None:
-    with whole(path) as new:
-        new.write_text(text, encoding='utf-8')
+        session_picture(trials, chains, path)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from errno import EEXIST
 import json
 import os
 from pathlib import Path
@@ -21,12 +22,16 @@ class Journal:
 
     An incomplete line, which a killed process leaves, is ignored.
 
+    :ivar failure: why an outcome could not be written; empty if all could be.
     :raises InputError: if the file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.failure = ''
         self._outcomes: dict[str, Outcome] = {}
+        if path.is_symlink() or (path.exists() and not path.is_file()):  # a FIFO would block for ever
+            raise self._unusable(OSError(EEXIST, 'something that is no file has this name'))
         try:
             text = path.read_text(encoding='utf-8', errors='replace') if path.exists() else ''
         except OSError as error:
@@ -44,11 +49,7 @@ class Journal:
         return self._outcomes.get(task.key)
 
     def add(self, task: Task, outcome: Outcome) -> None:
-        """
-        Append an outcome; it is on disk when this returns.
-
-        :raises InputError: if it cannot be written.
-        """
+        """Append an outcome; when this returns, it is on disk, or `failure` says why not."""
         line = json.dumps({
             'object': task.subject.name, 'search': task.search, 'seed': task.seed, 'engine': task.engine,
             'left_out': None if task.left_out is None else task.left_out + 1,
@@ -59,10 +60,11 @@ class Journal:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise self._unusable(error) from error
-        self._cut = False
+            self.failure, self._cut = error.strerror or str(error), True
+        else:
+            self._cut = False
         self._outcomes[task.key] = outcome
 
     def _unusable(self, error: OSError) -> InputError:
-        return InputError(f'file {self._path}', str(error), 'a file that can be read and written',
-                          'choose another folder with --output')
+        return InputError(f'file {self._path}', error.strerror or str(error),
+                          'a file that can be read and written', 'choose another folder with --output')

@@ -13,7 +13,7 @@ from processes import children
 import pytest
 from toy_messages import session_messages, write_session
 
-from dlo_calibration.cli.demo import samples
+from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types
 
@@ -45,7 +45,8 @@ def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path
     assert read_session(folder).problems == ()
 
 
-def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path, number):
     process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '1000')
     begun = time.monotonic()
     while not list((tmp_path / 'out').glob('dlo_session_*')):
@@ -53,9 +54,10 @@ def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path):
         assert process.poll() is None
         time.sleep(0.02)
     started = children(process.pid)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, errors.splitlines()[-1]) == (128 + number, 'demo: interrupted')
+    assert 'Traceback' not in errors
     assert started
     assert not any(os.path.exists(f'/proc/{pid}') for pid in started)
 

@@ -4,6 +4,7 @@
 """The verb `experiment`: what it writes and prints, and that it goes on where it was killed."""
 
 import csv
+import errno
 import functools
 import json
 import os
@@ -213,12 +214,51 @@ def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, work
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize('workers', [1, 2])
-def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers):
+def test_what_cannot_be_written_is_named_and_the_tables_are_told(run, session, tmp_path, undrawn,
+                                                                 monkeypatch):
+    out, replace, fsync = tmp_path / 'out', os.replace, os.fsync
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'replace',
+                      lambda new, path: full() if path.suffix == '.csv' else replace(new, path))
+        code, output, errors = run(session, *SMALL, '--output', out)
+    assert (code, output) == (2, (out / 'experiment.md').read_text())
+    assert ('could not be written: consistency.csv, validity.csv, calibrations.csv: No space left on device; '
+            'experiment.md, experiment.json') in errors.splitlines()[-1]
+    assert not {'validity.csv', 'consistency.csv', 'calibrations.csv'} & {one.name for one in out.iterdir()}
+    # A disk on which the journal finds no room after the first run: what is done is told, and kept as far
+    # as there was room.
+    kept = []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', lambda one: full() if len(kept) == 4 else kept.append(one) or fsync(one))
+        code, output, errors = run(session, *SMALL, '--output', tmp_path / 'other')
+    assert code == 2
+    assert 'Not complete' in output
+    assert 'could not be written: the end of calibrations.jsonl, ' in errors.splitlines()[-1]
+    code, _, errors = run(session, *SMALL, '--output', tmp_path / 'other')
+    assert code == 0
+    assert re.search('^[45] of 8 calibrations are done already$', errors, re.MULTILINE)
+
+
+@pytest.mark.parametrize('make', [os.mkfifo, lambda path: path.symlink_to(path.parent / 'elsewhere')])
+def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, make):
+    (tmp_path / 'out').mkdir()
+    make(tmp_path / 'out' / 'calibrations.jsonl')
+    code, output, errors = run(session, *SMALL, '--output', tmp_path / 'out')
+    assert (code, output) == (2, '')
+    assert 'calibrations.jsonl' in errors.splitlines()[-1]
+    assert [one.name for one in (tmp_path / 'out').iterdir()] == ['calibrations.jsonl']
+
+
+@pytest.mark.parametrize(('workers', 'number'), [(1, signal.SIGINT), (2, signal.SIGINT), (2, signal.SIGTERM)])
+def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
     process = started(session, tmp_path / 'out', workers)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130, errors
+    assert process.returncode == 128 + number, errors
     assert 'Traceback' not in errors
     assert 'interrupted' in errors
     done = (tmp_path / 'out' / 'calibrations.jsonl').read_text().splitlines()
