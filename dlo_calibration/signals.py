@@ -22,9 +22,15 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from Ctrl-C; from `kill` and `ros2 
 _cleaners: list[Callable[[], None]] = []
 
 
-def before_end(clean: Callable[[], None]) -> None:
-    """Have `clean` called when a signal ends the process."""
-    _cleaners.append(clean)
+def before_end(cleaner: Callable[[], None]) -> None:
+    """Have something called before a signal ends the process."""
+    _cleaners.append(cleaner)
+
+
+def clean() -> None:
+    """Call what `before_end` registered."""
+    for one in _cleaners:
+        one()
 
 
 def end_at_signals(program: str) -> None:
@@ -34,8 +40,7 @@ def end_at_signals(program: str) -> None:
     Child processes that simulate end with this one.
     """
     def end(number: int, frame: FrameType | None) -> None:
-        for clean in _cleaners:
-            clean()
+        clean()
         try:
             os.write(2, f'{program}: interrupted\n'.encode())  # sys.stderr may be in use at this moment
         except OSError:

@@ -113,7 +113,7 @@ class Attempts:
         try:
             yield
         except (DloCalibrationError, OSError) as error:
-            self.fail(name, _reason(error))
+            self.fail(name, reason(error))
         else:
             self.written.append(name)
 
@@ -142,8 +142,8 @@ class Attempts:
                                       'make room, or choose another folder, and repeat the command')
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """Return why something could not be written, without names that a user need not know."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
-    return error.came if isinstance(error, InputError) else ' '.join(str(error).split())
+    return error.came if isinstance(error, InputError) else ' '.join(str(error).split()) or repr(error)

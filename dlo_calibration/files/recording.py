@@ -11,6 +11,7 @@ Foxglove and the library rosbags can read it.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
 from io import StringIO
 import json
@@ -23,6 +24,7 @@ from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.writing import replacing
 
 OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
 METADATA_FILE = 'metadata.yaml'  # name and key are rosbag2's
@@ -67,12 +69,23 @@ class SessionWriter:
         except OSError as error:
             raise RecordingError(f'session {path}: cannot be written: {error}') from error
         self._writer = cast(Any, Writer(self._stream, compression=CompressionType.ZSTD))  # partly untyped
-        with self._disk():
-            self._writer.start(profile='ros2', library='dlo_calibration')
-            self._writer.flush()
-            self._write_metadata_file()
+        try:
+            with self._disk():
+                self._writer.start(profile='ros2', library='dlo_calibration')
+                self._writer.flush()
+                self._write_metadata_file()
+        except RecordingError:  # a session without content is of no use
+            with suppress(OSError):
+                self.file.unlink()
+                self.path.rmdir()
+            raise
         if options is not None:
             self.write_options(options)
+
+    @property
+    def failed(self) -> bool:
+        """Whether nothing can be written any more."""
+        return bool(self._failure)
 
     def write(self, topic: str, message_type: str, data: bytes, log_time: int, flush: bool = True) -> None:
         """
@@ -188,9 +201,9 @@ class SessionWriter:
         """Replace metadata.yaml at once, so that it is never incomplete."""
         if self.file == self.path:
             return
-        whole = self.path / f'{METADATA_FILE}.new'
-        whole.write_text(_yaml({METADATA_KEY: self._metadata()}) + '\n', encoding='utf-8')
-        whole.replace(self.path / METADATA_FILE)
+        # Without waiting for the disk, as the node calls this while it listens.
+        with replacing(self.path / METADATA_FILE, fsync=False) as new:
+            new.write_text(_yaml({METADATA_KEY: self._metadata()}) + '\n', encoding='utf-8')
 
 
 class _Disk:
@@ -220,7 +233,11 @@ def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
         except FileExistsError:
             continue
         file = free / f'{free.name}_0.mcap'
-        return free, file, file.open('xb')
+        try:
+            return free, file, file.open('xb')
+        except OSError:
+            free.rmdir()
+            raise
     raise OSError(f'{path} and its numbered names all exist')
 
 

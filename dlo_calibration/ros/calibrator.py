@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from typing import Sequence
 
-from dlo_calibration.signals import StopFlag
+from dlo_calibration.signals import clean, StopFlag
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -41,6 +41,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 2
     finally:
         stop.ignore()
+        clean()
 
 
 if __name__ == '__main__':

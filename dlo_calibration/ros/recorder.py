@@ -12,19 +12,22 @@ from typing import Callable
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import InputError
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
 from dlo_calibration.report.page import Origin, repeating_command
 from dlo_calibration.ros.report_writer import ReportWriter
+from dlo_calibration.writing import Attempts
 
 
 class Recorder:
     """
     Records one session after the other; a failing disk makes no method raise.
 
-    :param on_failure: called once, with the reason, when a session can no longer be written.
+    What cannot be written any more does not prevent the rest.
+
+    :param on_failure: called with each thing that cannot be written and the reason, and when a session
+        ends, with all that its folder lacks.
     :param make_simulator: for the report of a result.
     """
 
@@ -32,6 +35,7 @@ class Recorder:
         self._on_failure = on_failure
         self._reporter = ReportWriter(make_simulator)
         self._session: SessionWriter | None = None
+        self._missing: dict[Path, list[str]] = {}  # by the folder of a session that has not ended
 
     @property
     def folder(self) -> Path | None:
@@ -41,11 +45,11 @@ class Recorder:
     def begin(self, options: Options) -> None:
         """Begin a session in a new folder, if the option `record` is set."""
         if options.record:
-            name = time.strftime('dlo_session_%Y%m%d_%H%M%S')
+            path = Path(options.output_directory).expanduser() / time.strftime('dlo_session_%Y%m%d_%H%M%S')
             try:
-                self._session = SessionWriter(Path(options.output_directory).expanduser() / name)
+                self._session = SessionWriter(path)
             except RecordingError as error:
-                self._on_failure(str(error))
+                self._miss(path, f'everything: {_cause(error)}', str(error))
 
     def message(self, topic: str, kind: str, octets: bytes) -> None:
         """Record a message that was received or sent just now: CDR `octets` of the type `kind`."""
@@ -64,45 +68,68 @@ class Recorder:
         """
         if self._session is not None:
             folder = self._session.path
-            try:
-                path = _free(folder, 'result', '.xml')
-                write_result(path, result, options.flat())
-                write_evaluations(_free(folder, 'evaluations', '.csv'), result)
-            except InputError as error:
-                self._on_failure(str(error))
-                return
+            suffix, attempts = _free(folder), Attempts(folder)
+            name = f'result{suffix}.xml'
+            with attempts.attempt(name):
+                write_result(folder / name, result, options.flat())
+            name = f'evaluations{suffix}.csv'
+            with attempts.attempt(name):
+                write_evaluations(folder / name, result)
+            if attempts.failure:
+                self._miss(folder, attempts.failure)
             origin = Origin(folder.name, repeating_command(folder.name, options), options)
-            self._reporter.begin(folder / path.name.replace('result', 'report').replace('.xml', '.html'),
-                                 result, origin)
+            self._reporter.begin(folder / f'report{suffix}.html', result, origin)
 
     def tell(self) -> None:
         """Call `on_failure` for each report that could not be written since the last call."""
-        for text in self._reporter.failures():
-            self._on_failure(text)
+        for path, why in self._reporter.failures():
+            self._miss(path.parent, f'{path.name}: {why}')
 
     def end(self) -> None:
-        """End the session; without one, do nothing."""
+        """End the session, and tell what its folder lacks; without one, do nothing."""
         self._write(SessionWriter.close)
         self._session = None
+        self._conclude()
 
     def close(self) -> None:
-        """End the session, and wait for its report."""
-        self.end()
+        """End the session, wait for its report, and tell what its folder lacks."""
+        self._write(SessionWriter.close)
         self._reporter.close()
+        self.end()
+
+    def _conclude(self) -> None:
+        self.tell()
+        missing, self._missing = self._missing, {}
+        for folder, texts in missing.items():
+            self._on_failure(f'session {folder} is incomplete; could not be written: {"; ".join(texts)}')
+
+    def _miss(self, folder: Path, what: str, text: str = '') -> None:
+        """Tell now, and when the session ends, that something could not be written; `text` is for now."""
+        self._missing.setdefault(folder, []).append(what)
+        self._on_failure((text or f'session {folder}: could not be written: {what}')
+                         + '; once there is room, ~/reset begins a new session')
 
     def _write(self, write: Callable[[SessionWriter], None]) -> None:
-        if self._session is None:
+        session = self._session
+        if session is None or session.failed:
             return
         try:
-            write(self._session)
+            write(session)
         except RecordingError as error:
-            self._session = None  # first, as on_failure sends a message, which would be recorded
-            self._on_failure(str(error))
+            since = time.strftime('%H:%M:%S')
+            self._miss(session.path, f'messages from {since} on: {_cause(error)}', str(error))
 
 
-def _free(folder: Path, stem: str, suffix: str) -> Path:
-    """Return a file name that is not taken."""
-    path, number = folder / f'{stem}{suffix}', 2
-    while path.exists():
-        path, number = folder / f'{stem}_{number}{suffix}', number + 1
-    return path
+def _cause(error: RecordingError) -> str:
+    """Return why a session could not be written, in few words."""
+    cause = error.__cause__
+    return getattr(cause, 'strerror', None) or str(cause or error)
+
+
+def _free(folder: Path) -> str:
+    """Return what distinguishes the names of a result's files from those that are there: ``_2``, ..."""
+    suffix, number = '', 2
+    while any((folder / f'{stem}{suffix}{kind}').exists() for stem, kind in (
+            ('result', '.xml'), ('evaluations', '.csv'), ('report', '.html'))):
+        suffix, number = f'_{number}', number + 1
+    return suffix

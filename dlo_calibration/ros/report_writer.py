@@ -14,6 +14,9 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.report.page import Origin, write_report
+from dlo_calibration.writing import reason
+
+PATIENCE = 10.0  # s; whoever ends the node does not wait longer
 
 
 class ReportWriter:
@@ -25,31 +28,34 @@ class ReportWriter:
 
     def __init__(self, make_simulator: SimulatorFactory) -> None:
         self._make_simulator = make_simulator
-        self._failures: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._failures: queue.SimpleQueue[tuple[Path, str]] = queue.SimpleQueue()
         self._stop = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._threads: dict[threading.Thread, Path] = {}
 
     def begin(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
         """Begin to write a page; returns at once."""
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        self._threads = {thread: page for thread, page in self._threads.items() if thread.is_alive()}
         thread = threading.Thread(target=self._write, args=(path, result, origin), name='report', daemon=True)
-        self._threads.append(thread)
+        self._threads[thread] = path
         thread.start()
 
-    def failures(self) -> Iterator[str]:
-        """Yield a sentence for each page that could not be written since the last call."""
+    def failures(self) -> Iterator[tuple[Path, str]]:
+        """Yield each page that could not be written since the last call, and the reason."""
         while not self._failures.empty():
             yield self._failures.get_nowait()
 
     def close(self) -> None:
-        """End the simulations, and wait until the pages are written, at most 10 s for each."""
+        """End the simulations, and wait until the pages are written, at most `PATIENCE` for each."""
         self._stop.set()
-        for thread in self._threads:
-            thread.join(10.0)
+        for thread, path in self._threads.items():
+            thread.join(PATIENCE)
+            if thread.is_alive():
+                self._failures.put((path, f'it was not ready {PATIENCE:.0f} s after the end'))
+        self._threads = {}
 
     def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
         try:
             slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
             write_report(path, result, origin, slices)
         except Exception as error:  # the user must learn why there is no page
-            self._failures.put(f'the report could not be written: {" ".join(str(error).split()) or error!r}')
+            self._failures.put((path, reason(error)))

@@ -27,6 +27,7 @@ from dlo_calibration.files.result import description_document
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import KEPT, TrialCollector
+from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.markers import markers
@@ -312,7 +313,9 @@ class CalibrationSession:
             return
         memory, options = self._memory, calibration.options
         memory.state, memory.detail, memory.result = 'done', event.stop_reason, event
-        found = ', '.join(f'{name} {value:.1f}' for name, value in event.values.items())
+        found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
+                          f'{measured(one.physical_value, one.physical_unit)}'
+                          for name, one in event.parameters.items())
         self._graph.info(f'calibrated: {found}; score {event.best.score:.1f}, mean error '
                          f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
         for warning in event.warnings:

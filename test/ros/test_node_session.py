@@ -4,6 +4,9 @@
 """What the node knows and decides, without a graph."""
 
 from collections import defaultdict
+import errno
+import os
+from pathlib import Path
 import time
 
 import pytest
@@ -13,11 +16,13 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.files import recording
 from dlo_calibration.files.bag import encode
 from dlo_calibration.files.recording import typestore
-from dlo_calibration.files.result import read_description
+from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INITIAL, INPUT_TYPES
+from dlo_calibration.model.quantity import number
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.session import CalibrationSession
 
@@ -280,6 +285,73 @@ def test_disk_that_refuses_is_reported_and_the_session_goes_on(start, tmp_path):
     assert str(taken) in graph.status['last_refusal']
     graph.send(session_messages(TYPES, 1))
     graph.calibrated()
+
+
+class FullDisk:
+    """The file of a session on a disk that is full as long as `full` says so."""
+
+    def __init__(self, stream, full):
+        self._stream, self._full = stream, full
+
+    def __getattr__(self, name):
+        return getattr(self._stream, name)
+
+    def write(self, octets):
+        if self._full:
+            self._stream.write(octets[:7])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self._stream.write(octets)
+
+
+def test_what_a_full_disk_cost_is_told_and_the_result_is_told_and_tried_nevertheless(
+        start, tmp_path, monkeypatch):
+    full, create, replace = [], recording._create, os.replace
+
+    def refuse(new, path):
+        if full and Path(path).suffix == '.html':
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(new, path)
+
+    monkeypatch.setattr(os, 'replace', refuse)
+    monkeypatch.setattr(recording, '_create',
+                        lambda path: (*(made := create(path))[:2], FullDisk(made[2], full)))
+    graph = start(evaluations=3)
+    folder, = folders(tmp_path)
+    graph.send(session_messages(TYPES, 1))
+    before = len(read_session(folder).messages)
+    full.append('yes')
+    message = graph.calibrated()
+    for name, row in ((status.name, values(status)) for status in message.status):
+        assert name == 'calibration' or any(
+            f'{name} {number(float(row["value"]))} ({number(float(row["lower"]))} to ' in text
+            for text in graph.logged['info']), name
+    assert read_result(folder / 'result.xml').score == float(whole(message)['score'])
+    assert {file.name for file in folder.iterdir()} >= {'result.xml', 'evaluations.csv', 'metadata.yaml'}
+    assert len(read_session(folder).messages) == before
+    graph.until(lambda: any('report.html' in text for text in graph.logged['error']))
+    # As there is room again, a reset begins a session that is recorded.
+    full.clear()
+    assert graph.session.request('reset')[0]
+    text = graph.logged['error'][-1]
+    assert text.startswith(f'session {folder} is incomplete; could not be written: messages from ')
+    assert f'report.html: {os.strerror(errno.ENOSPC)}' in text
+    graph.send(session_messages(TYPES, 1))
+    graph.calibrated()
+    told = len(graph.logged['error'])
+    graph.session.close()
+    assert len(graph.logged['error']) == told
+    _, second = folders(tmp_path)
+    assert {file.name for file in second.iterdir()} == {
+        'result.xml', 'evaluations.csv', 'report.html', 'metadata.yaml', f'{second.name}_0.mcap'}
+    assert read_session(second).problems == ()
+
+
+def test_what_a_session_lacks_is_told_as_the_node_ends(start, tmp_path):
+    taken = tmp_path / 'file'
+    taken.write_text('not a folder')
+    graph = start(output_directory=str(taken))
+    graph.session.close()
+    assert 'is incomplete; could not be written: everything' in graph.logged['error'][-1]
 
 
 def test_nothing_is_written_where_recording_is_off(start, tmp_path):

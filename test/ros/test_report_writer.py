@@ -3,6 +3,8 @@
 
 """The reporter writes pages beside everything else, and whatever goes wrong there is told, not raised."""
 
+import errno
+import os
 import threading
 
 import pytest
@@ -60,6 +62,7 @@ def test_page_that_cannot_be_written_is_told_once(result, tmp_path, without_draw
     reporter = ReportWriter(lambda _: ToySimulator())
     reporter.begin(tmp_path / 'none' / 'report.html', result, ORIGIN)
     reporter.close()
-    told, = reporter.failures()
-    assert str(tmp_path / 'none' / 'report.html') in told
+    (path, why), = reporter.failures()
+    assert path == tmp_path / 'none' / 'report.html'
+    assert why == os.strerror(errno.ENOENT)
     assert list(reporter.failures()) == []
