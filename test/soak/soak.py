@@ -22,7 +22,9 @@ import time
 FOLDER = Path(__file__).resolve().parent
 sys.path += [str(FOLDER.parent / 'support'), str(FOLDER)]
 
-CAMPAIGNS: tuple[str, ...] = ()
+CAMPAIGNS: tuple[str, ...] = (
+    'interrupt',
+)
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')
 
 

@@ -17,3 +17,16 @@ def children(parent):
         except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
             pass
     return found
+
+
+def of_session(leader):
+    """Return the command lines of the living processes that were started in a process's session, by id."""
+    found = {}
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            fields = (folder / 'stat').read_text().rpartition(')')[2].split()
+            if int(fields[3]) == leader and fields[0] != 'Z':
+                found[int(folder.name)] = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+        except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
+            pass
+    return found
