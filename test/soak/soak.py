@@ -23,6 +23,7 @@ FOLDER = Path(__file__).resolve().parent
 sys.path += [str(FOLDER.parent / 'support'), str(FOLDER)]
 
 CAMPAIGNS: tuple[str, ...] = (
+    'disk',
     'interrupt',
 )
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')
