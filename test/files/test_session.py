@@ -519,6 +519,19 @@ def test_full_disk_is_one_kind_of_error_and_what_was_written_stays(tmp_path):
     assert found.problems
 
 
+def test_a_session_that_cannot_begin_leaves_nothing(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(RecordingError, match='session'):
+            SessionWriter(tmp_path / 'session')
+        with pytest.raises(RecordingError, match='session'):
+            SessionWriter(tmp_path / 'session.mcap')
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_closing_twice_is_harmless(tmp_path):
     writer = SessionWriter(tmp_path / 'session')
     write(writer)
