@@ -23,7 +23,7 @@ from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
-from dlo_calibration.simulation.obstacles import Obstacle, read_scene, unusable
+from dlo_calibration.simulation.obstacles import Obstacle, read_scene
 from dlo_calibration.simulation.protocol import DEFAULT_NODES
 from dlo_calibration.simulation.rope import diverged, Rope
 
@@ -50,6 +50,7 @@ with _silence():  # at import it prints its build time, also in the middle of a 
     import pybullet
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
+MESH_PIECE = 40_000  # triangles; PyBullet takes 131,072 vertices at once
 
 
 class BulletRope:
@@ -179,42 +180,27 @@ class BulletRope:
 
 
 def _add_obstacle(client: int, obstacle: Obstacle) -> None:
-    """Add an obstacle to a world."""
+    """Add an obstacle to a world; a large mesh becomes several bodies."""
     sizes = obstacle.sizes.tolist()
-    shape = pybullet.createCollisionShape(physicsClientId=client, **{
-        'box': {'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]},
-        'sphere': {'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]},
-        'cylinder': {'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]},
-        'capsule': {'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]},
-        'mesh': {'shapeType': pybullet.GEOM_MESH, 'fileName': obstacle.file, 'meshScale': sizes,
-                 'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH},
-    }[obstacle.shape])
-    body = pybullet.createMultiBody(
-        0, shape, basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
-        useMaximalCoordinates=True, physicsClientId=client)
-    pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
-                            physicsClientId=client)
-
-
-def _obstacles(scene: str) -> tuple[Obstacle, ...]:
-    """
-    Return the obstacles of a scene, and try to build them.
-
-    :raises InputError: if the file cannot be used.
-    """
-    found = read_scene(scene)
-    client = pybullet.connect(pybullet.DIRECT)
-    try:
-        for obstacle in found:
-            try:
-                with _silence():
-                    _add_obstacle(client, obstacle)
-            except pybullet.error as error:
-                raise unusable(scene, f'a {obstacle.shape} {obstacle.file} that PyBullet cannot load',
-                               'export the mesh as .obj or .stl') from error
-    finally:
-        pybullet.disconnect(physicsClientId=client)
-    return found
+    triangles = obstacle.triangles
+    for shape in ({
+            'box': [{'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]}],
+            'sphere': [{'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]}],
+            'cylinder': [{'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]}],
+            'capsule': [{'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]}],
+            'mesh': [{'shapeType': pybullet.GEOM_MESH, 'vertices': piece.reshape(-1, 3).tolist(),
+                      'indices': list(range(3 * len(piece))), 'meshScale': sizes,
+                      'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH}
+                     for piece in np.split(triangles, range(MESH_PIECE, len(triangles), MESH_PIECE))],
+            }[obstacle.shape]):
+        body = pybullet.createMultiBody(
+            0, pybullet.createCollisionShape(physicsClientId=client, **shape),
+            basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
+            useMaximalCoordinates=True, physicsClientId=client)
+        # PyBullet gives no margin to a mesh that it reads itself, but 1 mm to one that it is given.
+        margin = {'collisionMargin': 0.0} if obstacle.shape == 'mesh' else {}
+        pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
+                                physicsClientId=client, **margin)
 
 
 class BulletSimulator(Engine):
@@ -224,7 +210,7 @@ class BulletSimulator(Engine):
     The first trial builds the world; the others reset it.  The obstacles of a scene do
     not move.  The rope touches them with the evaluated radius; as Bullet cannot change
     the radius of a sphere, each new radius builds the world again: about 20 ms, plus the
-    time to read the meshes.
+    time to build the meshes.
 
     :param scene: path of a URDF file with fixed obstacles; empty: none.
     :param settings: see `Engine`.
@@ -235,7 +221,7 @@ class BulletSimulator(Engine):
 
     def __init__(self, *, scene: str = '', **settings: Any) -> None:
         super().__init__(**settings)
-        self._obstacles = _obstacles(scene) if scene else ()
+        self._obstacles = read_scene(scene) if scene else ()
         self._world: _World | None = None
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],

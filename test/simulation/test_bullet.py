@@ -8,12 +8,14 @@ What holds for every engine is in test_engine_contract.py.
 """
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pybullet
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
+from dlo_calibration.simulation import bullet
 from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
 
 GRAVITY = 9.81
@@ -166,11 +168,45 @@ def test_a_hollow_mesh_is_hollow(scene):
     simulator.close()
 
 
-def test_a_mesh_that_cannot_be_loaded_is_refused_in_silence(scene, capfd):
-    scene('solid nonsense', 'mesh.obj')
-    with pytest.raises(InputError, match='scene .*scene.urdf: got a mesh .*mesh.obj that PyBullet cannot'):
-        BulletSimulator(scene=scene(MESH))
+def test_a_mesh_that_would_end_pybullet_is_refused_in_silence(scene, capfd):
+    for text in ('solid nonsense', 'v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999'):
+        scene(text, 'mesh.obj')
+        with pytest.raises(InputError, match="scene .*scene.urdf: got the mesh 'mesh.obj': "):
+            BulletSimulator(scene=scene(MESH))
     assert capfd.readouterr() == ('', '')
+
+
+def test_a_mesh_in_pieces_does_the_same_as_pybullets_own_reader(scene, monkeypatch):
+    """A wavy sheet of 882 triangles, scaled."""
+    grid = np.linspace(0, 1, 22)
+    index = np.arange(22 * 22).reshape(22, 22)
+    quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4) + 1
+    scene(''.join(f'v {x} {y} {0.02 * np.sin(9 * x + 7 * y)}\n' for x in grid for y in grid)
+          + ''.join(f'f {" ".join(map(str, quad))}\n' for quad in quads), 'mesh.obj')
+    path = scene(MESH.replace('"mesh.obj"', '"mesh.obj" scale="0.7 0.5 1.3"').replace(
+        '<geometry>', '<origin xyz="-0.05 -0.2 0.2"/><geometry>'))
+    found = []
+    for size in (100_000, 100):
+        monkeypatch.setattr(bullet, 'MESH_PIECE', size)
+        simulator = BulletSimulator(scene=path, settle_limit=1.0)
+        found.append(simulator.simulate(dropped(0.25), PHYSICAL).chains)
+        simulator.close()
+
+    def theirs(*plane, **shape):
+        if 'vertices' in shape:
+            del shape['vertices'], shape['indices']
+            shape['fileName'] = str(Path(path).parent / 'mesh.obj')
+        return shape_of(*plane, **shape)
+
+    shape_of = pybullet.createCollisionShape
+    monkeypatch.setattr(bullet, 'MESH_PIECE', 100_000)
+    monkeypatch.setattr(bullet.pybullet, 'createCollisionShape', theirs)
+    simulator = BulletSimulator(scene=path, settle_limit=1.0)
+    expected = simulator.simulate(dropped(0.25), PHYSICAL).chains
+    simulator.close()
+    assert expected[0, :, 2].min() > 0.15
+    assert found[0].tobytes() == expected.tobytes()
+    assert np.abs(found[1] - expected).max() < 2e-3
 
 
 def test_a_scene_stands_where_pybullets_own_importer_puts_it(scene, capfd):
