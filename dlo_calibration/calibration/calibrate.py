@@ -111,4 +111,4 @@ def _executor(options: Options, on_death: Callable[[str], None],
     if options.scheduler:
         return ClusterExecutor(options.scheduler, on_death, on_wait)
     workers = min(options.workers or cores(), options.evaluations)
-    return ProcessExecutor(workers, on_death) if workers > 1 else None
+    return ProcessExecutor(workers, on_death, options.answer_limit) if workers > 1 else None

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import functools
 import logging
+from multiprocessing import parent_process
 from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.apart import SimulatorApart
 from dlo_calibration.simulation.protocol import Simulator
 
 SimulatorFactory = Callable[[Options], Simulator]
@@ -19,7 +21,11 @@ SimulatorFactory = Callable[[Options], Simulator]
 def _bullet(options: Options) -> Simulator:
     from dlo_calibration.simulation.bullet import BulletSimulator
 
-    return BulletSimulator(**_settings(options), scene=options.scene)
+    simulator = BulletSimulator(**_settings(options), scene=options.scene)
+    if not options.scene or parent_process() is not None:  # a worker's process is one of its own already
+        return simulator
+    # A scene may come from a stranger: what it does to PyBullet must not end the node or the command.
+    return SimulatorApart(simulator, f'scene {options.scene}', options.answer_limit)
 
 
 def _compiled(options: Options) -> Simulator:

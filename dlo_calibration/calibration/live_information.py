@@ -136,7 +136,8 @@ class LiveInformation:
         if all(key in informations for _, key in new):
             return
         known, length = posterior(trials, space, height, best, examination), mean_length(trials)
-        with closing(self._make_simulator(options)) as simulator, closing(ProcessExecutor(1)) as process:
+        with (closing(self._make_simulator(options)) as simulator,
+              closing(ProcessExecutor(1, answer_limit=options.answer_limit)) as process):
             for trial, key in new:
                 fresh = key not in informations
                 if fresh:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Iterator, Mapping
 
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.processes import ANSWER_LIMIT
 from dlo_calibration.model.parameters import (
     BY_NAME,
     MOST_PARTS,
@@ -126,6 +127,9 @@ class Options:
     scheduler: str = _option(
         '', 'address of a Dask scheduler, e.g. tcp://host:8786; its workers then simulate, on any number of '
         'machines, and the option workers has no effect; empty: simulate on this machine', of=MACHINE)
+    answer_limit: float = _option(
+        ANSWER_LIMIT, 'time without a sign of life after which a process that simulates is replaced and its '
+        'evaluation is repeated', unit='s', minimum=1.0, maximum=86400.0, of=MACHINE)
     nodes: int = _option(DEFAULT_NODES, 'number of point masses of the simulated DLO', minimum=8,
                          maximum=1000)
     time_step: float = _option(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,

@@ -3,6 +3,7 @@
 
 """Parameter sets evaluated on all trials, in this process, others or a cluster; and their residuals."""
 
+from dlo_calibration.evaluation.apart import SimulatorApart
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
@@ -13,4 +14,4 @@ from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 
 __all__ = ['BatchEvaluator', 'ClusterExecutor', 'Evaluation', 'Evaluator', 'Huber', 'Linearisation',
-           'ProcessExecutor', 'ResidualLayout']
+           'ProcessExecutor', 'ResidualLayout', 'SimulatorApart']

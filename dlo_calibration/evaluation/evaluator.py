@@ -18,7 +18,7 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Rollout, Simulator
+from dlo_calibration.simulation.protocol import advanced, Rollout, Simulator
 
 
 def mean_length(trials: Sequence[Trial]) -> float:
@@ -65,6 +65,7 @@ class Evaluator:
                 raise CancelledError
             try:
                 rollouts.append(self.simulator.simulate(trial, physical))
+                advanced()
             except SimulationError as error:
                 return replace(evaluation, failure=str(error), skipped=len(self.trials) - len(rollouts) - 1)
         evaluation = replace(

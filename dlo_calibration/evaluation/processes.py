@@ -5,7 +5,7 @@
 ProcessExecutor: processes that simulate.
 
 They end as soon as the process that started them ends, for whatever reason.  A process that
-dies is replaced, and its call is repeated.
+dies, or hangs, is replaced, and its call is repeated.
 """
 
 from __future__ import annotations
@@ -22,14 +22,19 @@ import queue
 import signal
 import sys
 import threading
+import time
 import traceback
 import types
 from typing import Any, Callable, Iterator, Mapping
 
 from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.simulation.protocol import advances
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 DEATHS = 3  # processes that may die at the same call before it fails
+ANSWER_LIMIT = 60.0  # s without a sign of life after which a process counts as hanging; the default
+SIGN_PERIOD = 0.25  # s between two signs of life; a small part of the shortest limit, 1 s
+START_LIMIT = 60.0  # s more for the first sign: on a busy machine Python may take some seconds to start
 _starting = threading.Lock()
 
 
@@ -46,14 +51,18 @@ class ProcessExecutor(Executor):
     ignore SIGINT and SIGTERM: the parent handles these.  They do not import the
     main module, so nothing that is defined there can be sent to them.  A process
     that dies is replaced and its call is repeated; a call at which `DEATHS`
-    processes died ends with a `DloCalibrationError`.
+    processes died ends with a `ProcessEnded`.  A process that hangs is killed: it gives
+    a sign of life as long as it loads modules, and then whenever its simulation advances.
 
     :param on_death: called with a sentence for each death, from any thread.
+    :param answer_limit: time [s] without a sign of life after which a process that works is killed.
     """
 
-    def __init__(self, workers: int, on_death: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, workers: int, on_death: Callable[[str], None] = lambda _: None,
+                 answer_limit: float = ANSWER_LIMIT) -> None:
         self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._on_death = on_death
+        self._answer_limit = answer_limit
         self._closed = threading.Event()
         self._processes: dict[_Process, connection.Connection] = {}
         self._changing = threading.Lock()  # guards `_processes`
@@ -70,6 +79,7 @@ class ProcessExecutor(Executor):
                          for process in first]
         for thread in self._threads:
             thread.start()
+        threading.Thread(target=self._watch, name='watching simulations', daemon=True).start()
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
         """Return a future that may be cancelled until a process takes it."""
@@ -137,6 +147,30 @@ class ProcessExecutor(Executor):
             self._processes.pop(process).close()
         process.join()
 
+    def _watch(self) -> None:
+        """Kill processes that hang; runs in a thread of its own while the others do."""
+        while not self._closed.wait(SIGN_PERIOD) and any(thread.is_alive() for thread in self._threads):
+            with self._changing:
+                for process in self._processes:
+                    if process.works:
+                        # Counted, not measured: while this process is stopped too, nobody is silent.
+                        process.silence += SIGN_PERIOD
+                        if process.silence > self._answer_limit:
+                            process.kill()
+
+    def _answer(self, process: _Process, task: _Task) -> tuple[Any, BaseException | None]:
+        """Return the result or the error of a call in a process."""
+        channel = self._processes[process]
+        process.silence, process.works = min(process.silence, 0.0), True
+        try:
+            channel.send((task.call, task.args, task.keywords))
+            while (answer := channel.recv()) is None:  # a sign of life
+                process.silence = 0.0
+        finally:
+            process.works = False
+        result: tuple[Any, BaseException | None] = answer
+        return result
+
     def _serve(self, process: _Process | None) -> None:
         """Pass waiting tasks to a process, replacing it when it dies; runs in a thread per process."""
         while (task := self._tasks.get()) is not None:
@@ -151,21 +185,20 @@ class ProcessExecutor(Executor):
         while True:
             try:
                 process = process or self._new_process()
-                channel = self._processes[process]
-                channel.send((task.call, task.args, task.keywords))
-                result, failure = channel.recv()
+                result, failure = self._answer(process, task)
             except (EOFError, OSError):
                 assert process is not None
                 self._end(process)
-                deaths, ending, process = deaths + 1, _ending(process.exitcode), None
+                deaths, ended, process = deaths + 1, process, None
+                ending, remedy = self._ending(ended)
                 if self._closed.is_set():
                     task.future.set_exception(CancelledError())
                     return None
                 self._on_death(f'a process that simulates {ending}; its evaluation is repeated')
                 if deaths == DEATHS:
-                    task.future.set_exception(DloCalibrationError(
+                    task.future.set_exception(ProcessEnded(
                         f'{DEATHS} processes one after the other ended unexpectedly at the same evaluation, '
-                        f'the last one {ending}; free memory, or use fewer workers'))
+                        f'the last one {ending}; {remedy}'))
                     return None
             except BaseException as error:  # no new process could start, or the call cannot be pickled
                 task.future.set_exception(error)
@@ -177,6 +210,23 @@ class ProcessExecutor(Executor):
                     task.future.set_exception(failure)
                 return process
 
+    def _ending(self, process: _Process) -> tuple[str, str]:
+        """Return in words how a process ended, and what to do about it."""
+        code, remedy = process.exitcode, 'free memory, or use fewer workers'
+        if process.silence > self._answer_limit:
+            return (f'gave no answer for {self._answer_limit:g} s and is replaced',
+                    'raise answer_limit, or use fewer workers')
+        if code is None or code >= 0:
+            return f'ended unexpectedly with exit code {code}', remedy
+        killed = f'was killed by {signal.Signals(-code).name}'
+        if code == -signal.SIGKILL:
+            return f'{killed}, as happens when memory runs out', remedy
+        return killed, f'{remedy}, or simulate without a scene'
+
+
+class ProcessEnded(DloCalibrationError):
+    """A call at which `DEATHS` processes ended."""
+
 
 @dataclass(frozen=True)
 class _Task:
@@ -186,16 +236,11 @@ class _Task:
     keywords: Mapping[str, Any]
 
 
-def _ending(code: int | None) -> str:
-    """Return in words how a process with this exit code ended."""
-    if code is not None and code < 0:
-        killed = f'was killed by {signal.Signals(-code).name}'
-        return f'{killed}, as happens when memory runs out' if code == -signal.SIGKILL else killed
-    return f'ended unexpectedly with exit code {code}'
-
-
 class _Process(SpawnProcess):
     """A spawned process that starts with signals blocked and without the parent's main module."""
+
+    works = False  # whether it executes a call
+    silence = -START_LIMIT  # s without a sign of life while it worked
 
     def start(self) -> None:
         # Start Python's resource tracker first: starting it later would unblock the signals again.
@@ -223,14 +268,44 @@ def _blocked_signals() -> Iterator[None]:
 def _work(channel: connection.Connection) -> None:
     """Execute calls until the parent closes the connection; the main function of a process."""
     _begin()
+    sending, works = threading.Lock(), threading.Event()
+    threading.Thread(target=_give_signs, args=(channel, sending, works), daemon=True).start()
     while True:
         try:
-            call, args, keywords = channel.recv()
-            channel.send((call(*args, **keywords), None))
+            octets = channel.recv_bytes()
+            works.set()
+            call, args, keywords = ForkingPickler.loads(octets)
+            answer = call(*args, **keywords), None
+            works.clear()
+            with sending:
+                channel.send(answer)
         except (EOFError, BrokenPipeError):
             return
         except BaseException as error:
-            channel.send((None, _sendable(error)))
+            works.clear()
+            with sending:
+                channel.send((None, _sendable(error)))
+
+
+def _give_signs(channel: connection.Connection, sending: threading.Lock, works: threading.Event) -> None:
+    """
+    Give signs of life while a call advances; runs in a thread.
+
+    A process that is stopped gives none, nor does one in whose simulation nothing is counted.  Before
+    the first count it may be loading modules or compiling, which nothing counts.
+    """
+    seen = 0
+    while works.wait():
+        count = advances()
+        if count == 0 or count != seen:
+            seen = count
+            with sending:
+                if works.is_set():
+                    try:
+                        channel.send(None)
+                    except OSError:  # the parent has closed the connection
+                        return
+        time.sleep(SIGN_PERIOD)
 
 
 def _sendable(error: BaseException) -> BaseException:

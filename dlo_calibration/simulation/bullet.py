@@ -24,7 +24,7 @@ from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene
-from dlo_calibration.simulation.protocol import DEFAULT_NODES
+from dlo_calibration.simulation.protocol import advanced, DEFAULT_NODES
 from dlo_calibration.simulation.rope import diverged, Rope
 
 
@@ -170,6 +170,7 @@ class BulletRope:
         """
         for k, target in enumerate(targets):
             self.step(target)
+            advanced()
             if path is not None:
                 path[k] = self._rope.state.points
 
@@ -223,6 +224,16 @@ class BulletSimulator(Engine):
         super().__init__(**settings)
         self._obstacles = read_scene(scene) if scene else ()
         self._world: _World | None = None
+
+    def prepare(self) -> None:
+        """Build the scene once, so that one that cannot be built is known before there are copies."""
+        super().prepare()
+        client = pybullet.connect(pybullet.DIRECT)
+        try:
+            for obstacle in self._obstacles:
+                _add_obstacle(client, obstacle)
+        finally:
+            pybullet.disconnect(physicsClientId=client)
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> BulletRope:

@@ -18,6 +18,18 @@ from dlo_calibration.model.trial import Trial
 DEFAULT_NODES = 41
 DEFAULT_TIME_STEP = 0.003  # s
 
+_advances = [0]
+
+
+def advanced() -> None:
+    """Count one more piece of a simulation in this process; called at least every few seconds."""
+    _advances[0] += 1
+
+
+def advances() -> int:
+    """Return how many pieces were counted in this process; what hangs does not count any more."""
+    return _advances[0]
+
 
 @dataclass(frozen=True)
 class Rollout:

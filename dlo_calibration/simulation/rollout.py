@@ -24,9 +24,10 @@ from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import NodeLayout
-from dlo_calibration.simulation.protocol import Rollout
+from dlo_calibration.simulation.protocol import advanced, Rollout
 
 CHECKS = 5  # of the displacement within one `Settling.time`
+PIECE = 1000  # steps in one call of a stepper: at most some seconds, even with 1000 nodes
 ROUNDING = 1e-9  # s; instants that differ by less are the same
 
 
@@ -239,7 +240,10 @@ class _Course:
         targets = [grip.path[np.minimum(np.arange(count) + self._steps - grip.closed, len(grip.path) - 1)]
                    for grip in self._grips.values()]
         steps = np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3))
-        self._stepper.advance(steps, path)
+        for begin in range(0, count, PIECE):
+            piece = slice(begin, begin + PIECE)
+            self._stepper.advance(steps[piece], None if path is None else path[piece])
+            advanced()
         self._time += count * self._stepper.time_step
         self._steps += count
         self._rests = False
