@@ -232,8 +232,9 @@ class _Reader:
             prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(':')
             found = (Path(prefix) / 'share' / rest for prefix in prefixes if prefix)
             return next((file for file in found if file.exists()), None)
-        folder = Path(self._path).resolve().parent
-        file = (folder / (rest or name)).resolve()
+        # Unlike `Path.resolve`, this does not fail at links that form a loop.
+        folder = Path(os.path.realpath(self._path)).parent
+        file = Path(os.path.realpath(folder / (rest or name)))
         if not file.is_relative_to(folder):
             raise unusable(self._path, f'the mesh {shown(name)!r}, which is outside the folder of the scene',
                            'move it there, or name it package://...')

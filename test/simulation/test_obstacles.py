@@ -58,7 +58,9 @@ def test_meshes_are_found_beside_the_scene_and_in_packages(scene, tmp_path, monk
         obstacle, = scene(MESH.format(name))
         assert len(obstacle.triangles) == count
         assert obstacle.sizes.tolist() == [1, 1, 1]
-    for name in ('other.stl', 'package://other/m.stl', 'package://cell/../m.obj', 'package:///m.obj', ''):
+    (tmp_path / 'loop.stl').symlink_to('loop.stl')
+    for name in ('other.stl', 'loop.stl', 'package://other/m.stl', 'package://cell/../m.obj',
+                 'package:///m.obj', ''):
         with pytest.raises(InputError, match='the mesh .*, which is not there'):
             scene(MESH.format(name))
 

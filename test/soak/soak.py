@@ -25,6 +25,7 @@ sys.path += [str(FOLDER.parent / 'support'), str(FOLDER)]
 CAMPAIGNS: tuple[str, ...] = (
     'disk',
     'interrupt',
+    'scenes',
 )
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')
 
