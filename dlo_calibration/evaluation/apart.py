@@ -33,6 +33,7 @@ class SimulatorApart:
         self._answer_limit = answer_limit
         self._sent = _Once(simulator)
         self._trials: dict[int, tuple[Trial, _Once]] = {}
+        self._owner = self  # whose process executes the calls
         self._executor: ProcessExecutor | None = None
 
     def prepare(self) -> None:
@@ -58,21 +59,26 @@ class SimulatorApart:
         return found
 
     def refined(self) -> SimulatorApart | None:
-        """Return a simulator with twice the segments and half the time step, in another process again."""
+        """Return a simulator with twice the segments and half the time step, in the same process."""
         finer = self._simulator.refined()
-        return None if finer is None else SimulatorApart(finer, self._content, self._answer_limit)
+        if finer is None:
+            return None
+        apart = SimulatorApart(finer, self._content, self._answer_limit)
+        apart._owner = self._owner
+        return apart
 
     def close(self) -> None:
-        """End the process; the next call starts another."""
+        """End the process, unless it is that of a coarser simulator; the next call starts another."""
         self._trials.clear()
         if self._executor is not None:
             self._executor.close()
             self._executor = None
 
     def _there(self, call: Callable[..., Any], *args: Any) -> Any:
-        self._executor = self._executor or ProcessExecutor(1, answer_limit=self._answer_limit)
+        owner = self._owner
+        owner._executor = owner._executor or ProcessExecutor(1, answer_limit=self._answer_limit)
         try:
-            return self._executor.submit(call, *args).result()
+            return owner._executor.submit(call, *args).result()
         except ProcessEnded as error:
             raise DloCalibrationError(f'the {self._content} could not be simulated: {error}') from error
 

@@ -32,6 +32,11 @@ def scene(tmp_path):
     return str(tmp_path / 'box.urdf')
 
 
+def simulating():
+    """Return the ids of the processes that simulate."""
+    return {pid for pid, text in children(os.getpid()).items() if 'spawn_main' in text}
+
+
 def tried(simulator, point=MIDDLE):
     return Evaluator(toy_trials(2), ParameterSpace(), simulator).evaluate(0, point)
 
@@ -58,15 +63,27 @@ class Located(ToySimulator):
 
 def test_it_is_executed_elsewhere_and_pickled_it_is_the_simulator():
     apart = SimulatorApart(Located(), 'toy')
-    before = set(children(os.getpid()))
+    before = simulating()
     with pytest.raises(SimulationError) as told:
         apart.prepare()
     assert int(str(told.value)) != os.getpid()
-    assert set(children(os.getpid())) == before  # nothing stays behind
+    assert simulating() == before  # nothing stays behind
     assert type(pickle.loads(pickle.dumps(apart))) is Located  # noqa: S301
     assert type(copy.copy(apart)) is SimulatorApart
     assert apart.refined() is None
-    assert type(SimulatorApart(BulletSimulator(), '').refined()) is SimulatorApart
+
+
+def test_a_finer_one_is_in_the_same_process(scene):
+    before = simulating()
+    engine = BulletSimulator(scene=scene, settle_limit=0.1, time_step=0.01, nodes=9)
+    with closing(SimulatorApart(engine, 'scene')) as apart, closing(engine.refined()) as itself:
+        tried(apart)
+        finer = apart.refined()
+        assert tried(finer).residuals.tobytes() == tried(itself).residuals.tobytes()
+        assert len(simulating() - before) == 1
+        finer.close()
+        assert len(simulating() - before) == 1
+    assert simulating() == before
 
 
 def test_a_crash_is_told_with_what_made_it_and_the_next_call_works():
