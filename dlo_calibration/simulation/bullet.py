@@ -14,14 +14,17 @@ from __future__ import annotations
 from contextlib import contextmanager
 import ctypes
 import os
+from tempfile import gettempdir, NamedTemporaryFile
 from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
+from dlo_calibration.simulation.mesh import stl_octets
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene
 from dlo_calibration.simulation.protocol import advanced, DEFAULT_NODES
@@ -50,7 +53,6 @@ with _silence():  # at import it prints its build time, also in the middle of a 
     import pybullet
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
-MESH_PIECE = 40_000  # triangles; PyBullet takes 131,072 vertices at once
 
 
 class BulletRope:
@@ -181,27 +183,46 @@ class BulletRope:
 
 
 def _add_obstacle(client: int, obstacle: Obstacle) -> None:
-    """Add an obstacle to a world; a large mesh becomes several bodies."""
+    """
+    Add an obstacle to a world.
+
+    :raises DloCalibrationError: if a mesh cannot be handed over.
+    """
     sizes = obstacle.sizes.tolist()
-    triangles = obstacle.triangles
-    for shape in ({
-            'box': [{'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]}],
-            'sphere': [{'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]}],
-            'cylinder': [{'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]}],
-            'capsule': [{'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]}],
-            'mesh': [{'shapeType': pybullet.GEOM_MESH, 'vertices': piece.reshape(-1, 3).tolist(),
-                      'indices': list(range(3 * len(piece))), 'meshScale': sizes,
-                      'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH}
-                     for piece in np.split(triangles, range(MESH_PIECE, len(triangles), MESH_PIECE))],
-            }[obstacle.shape]):
-        body = pybullet.createMultiBody(
-            0, pybullet.createCollisionShape(physicsClientId=client, **shape),
-            basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
-            useMaximalCoordinates=True, physicsClientId=client)
-        # PyBullet gives no margin to a mesh that it reads itself, but 1 mm to one that it is given.
-        margin = {'collisionMargin': 0.0} if obstacle.shape == 'mesh' else {}
-        pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
-                                physicsClientId=client, **margin)
+    with _file_of(obstacle.triangles) as file:
+        shape = pybullet.createCollisionShape(physicsClientId=client, **{
+            'box': {'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]},
+            'sphere': {'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]},
+            'cylinder': {'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]},
+            'capsule': {'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]},
+            'mesh': {'shapeType': pybullet.GEOM_MESH, 'fileName': file, 'meshScale': sizes,
+                     'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH},
+        }[obstacle.shape])
+    body = pybullet.createMultiBody(
+        0, shape, basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
+        useMaximalCoordinates=True, physicsClientId=client)
+    pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
+                            physicsClientId=client)
+
+
+@contextmanager
+def _file_of(triangles: Floats) -> Iterator[str]:
+    """
+    Give the path of a file with checked triangles, for a while; empty if there are none.
+
+    PyBullet takes arrays, too, but does not free them with the world.
+    """
+    if not len(triangles):
+        yield ''
+        return
+    try:
+        with NamedTemporaryFile(prefix='dlo_mesh_', suffix='.stl') as file:
+            file.write(stl_octets(triangles))
+            file.flush()
+            yield file.name
+    except OSError as error:
+        raise DloCalibrationError(f'a mesh of the scene could not be handed to PyBullet ({error}); '
+                                  f'free space in {gettempdir()}') from error
 
 
 class BulletSimulator(Engine):

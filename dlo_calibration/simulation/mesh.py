@@ -5,6 +5,7 @@
 Meshes of a scene: the triangles of .obj and .stl files, checked.
 
 No other parser sees such a file: that of PyBullet ends the process at an index out of range.
+It gets a file that is written here.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from dlo_calibration.model.chain import Floats
 
 KINDS = ('.obj', '.stl')
-MOST_TRIANGLES = 500_000  # of all meshes of a scene: about 300 MB in Bullet
+MOST_TRIANGLES = 200_000  # of all meshes of a scene: about 250 MB in Bullet
 LARGEST_FILE = 64 * 2**20  # bytes; that many triangles need less
 LONGEST_LINE = 10_000  # bytes; a face of a thousand corners fits
 FURTHEST = 1e6  # m; Bullet computes meshes with 7 digits, so that 10 cm are lost there already
@@ -63,6 +64,13 @@ def read_mesh(path: str) -> Floats:
     if not (np.abs(triangles) <= FURTHEST).all():  # neither is NaN
         raise ValueError(f'a coordinate that is no number up to {FURTHEST:g}')
     return triangles.astype(float)
+
+
+def stl_octets(triangles: Floats) -> bytes:
+    """Return the binary .stl file of (t, 3, 3) [m] triangles as `read_mesh` returns them."""
+    facets = np.zeros(len(triangles), _FACET)
+    facets['corners'] = triangles
+    return bytes(80) + len(triangles).to_bytes(4, 'little') + facets.tobytes()
 
 
 def _obj(stream: BinaryIO) -> Floats:

@@ -194,7 +194,7 @@ def _large(path: Path, generator: np.random.Generator) -> None:
     many = int(generator.integers(20))
     path.write_bytes(mesh('m.obj' if many == 1 else 'm.stl'))
     if many == 0:
-        (path.parent / 'm.stl').write_bytes(stl(sheet(500)))  # 500,000 triangles
+        (path.parent / 'm.stl').write_bytes(stl(sheet(316)))  # 199,712 triangles
     elif many == 1:
         line = (b'\n', b'v 0 0 0\n', b'f 1 2 3\n')[generator.integers(3)]
         (path.parent / 'm.obj').write_bytes(line * 6_000_000)
