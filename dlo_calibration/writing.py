@@ -126,7 +126,7 @@ class Attempts:
         """What could not be written and why, as a part of a sentence; empty if all could be."""
         if not self._failed:
             return ''
-        names = [f'{name} (an older one is there)' if (self.folder / name).exists() else name
+        names = [f'{name} (an older one is there)' if (self.folder / name).is_file() else name
                  for name in self._failed]
         return f'{", ".join(names)}: {"; ".join(dict.fromkeys(self._failed.values()))}'
 

@@ -84,7 +84,8 @@ def _node(options: dict[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes
     command = [sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args']
     for name, value in options.items():
         command += ['-p', f'{name}:={json.dumps(value)}']  # ROS expects YAML, and JSON is valid YAML
-    with log.open('wb') as stream:
+    log.unlink(missing_ok=True)  # it may be a link
+    with log.open('xb') as stream:
         child = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
         try:
             yield child

@@ -17,7 +17,7 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.report.drawing import hand_colours, numbered, View
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.writing import whole
+from dlo_calibration.writing import Attempts, whole
 
 FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
@@ -97,13 +97,16 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
 
     :param physical: parameters by name (SI units).
     :param note: called with the path of each file after it was written.
-    :raises InputError: if a file cannot be written.
+    :raises DloCalibrationError: if files cannot be written; the others are.
     :raises SimulationError: if a trial cannot be simulated.
     """
-    paths = numbered(trials, folder, '.gif')
+    paths, attempts = numbered(trials, folder, '.gif'), Attempts(folder)
     for trial, path in zip(trials, paths, strict=True):
-        write_animation(trial, simulated_motion(trial, simulator, physical), path)
-        note(str(path))
+        motion = simulated_motion(trial, simulator, physical)
+        with attempts.attempt(path.name):
+            write_animation(trial, motion, path)
+            note(str(path))
+    attempts.require()
     return paths
 
 

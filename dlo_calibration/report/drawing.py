@@ -39,7 +39,7 @@ from dlo_calibration.report.figure import (
     YELLOW,
 )
 from dlo_calibration.report.sentences import MEAN_DISTANCE
-from dlo_calibration.writing import make_folder
+from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -121,12 +121,14 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
     Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is created; see `session_picture`.
 
     :param note: called with the path of each file after it was written.
-    :raises InputError: if a file cannot be written.
+    :raises DloCalibrationError: if files cannot be written; the others are.
     """
-    paths = numbered(trials, folder, '.png')
+    paths, attempts = numbered(trials, folder, '.png'), Attempts(folder)
     for k, (trial, path) in enumerate(zip(trials, paths, strict=True)):
-        session_picture([trial], None if chains is None else [chains[k]], path)
-        note(str(path))
+        with attempts.attempt(path.name):
+            session_picture([trial], None if chains is None else [chains[k]], path)
+            note(str(path))
+    attempts.require()
     return paths
 
 

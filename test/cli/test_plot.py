@@ -79,6 +79,18 @@ def test_animation_is_a_gif_per_trial(run, session, result, tmp_path, monkeypatc
         assert Image.open(path).n_frames > 2
 
 
+def test_a_picture_that_cannot_be_written_prevents_no_other(run, session, tmp_path):
+    (tmp_path / 'out' / 'trial_1.png').mkdir(parents=True)
+    (tmp_path / 'elsewhere').write_text('precious')
+    (tmp_path / 'out' / 'trial_2.png').symlink_to(tmp_path / 'elsewhere')
+    code, _, errors = run('plot', session, '--output', tmp_path / 'out')
+    assert code == 2
+    assert 'could not be written: trial_1.png' in errors.splitlines()[-1]
+    assert 'trial_2.png could be' in errors.splitlines()[-1]
+    assert (tmp_path / 'out' / 'trial_2.png').read_bytes().startswith(b'\x89PNG')
+    assert (tmp_path / 'elsewhere').read_text() == 'precious'
+
+
 def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
     (tmp_path / 'here').mkdir()
     monkeypatch.chdir(tmp_path / 'here')
