@@ -70,7 +70,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
     real = subprocess.run(['unshare', '-rm', 'true'], capture_output=True, check=False).returncode == 0
     for turn in range(amount):
         size = round(SIZES[0] * (SIZES[1] / SIZES[0]) ** choose.random())
-        act = (on_fit, on_node, on_experiment)[turn % 3]
+        act = (on_node, on_fit, on_experiment)[turn % 3]
         lost, died, refused = act(Disk(folder / str(turn), size, real), session)
         tally.tried += 1
         tally.refused += refused
