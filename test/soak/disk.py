@@ -32,7 +32,7 @@ from dlo_calibration.messages.codec import bag_types
 
 SHORT, FULL = 1, 45
 PATIENCE = 90.0  # s for a process
-SIZES = 4, 2000  # kB; the largest has room for all files
+SIZES = 4, 600  # kB; the largest has room for all files of most commands
 SMALL = {'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,
          'evaluations': 6, 'workers': 1}
 #: A disk of $1 kB at $2, for the command in the other words; its files are in $3 afterwards.
