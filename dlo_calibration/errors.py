@@ -1,13 +1,59 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The package's exceptions: one base class, unusable inputs, and simulations that fail."""
+"""
+The package's exceptions: one base class, unusable inputs, and simulations that fail.
+
+What came from outside can be in their texts: they are one line, short, and safe to show in a terminal.
+"""
 
 from __future__ import annotations
 
+import re
+from typing import Sequence
+
+LONGEST = 300  # characters of an error's text: a few lines of a terminal, whatever came
+
+#: Control characters (C0, DEL, C1), separators of lines, bidirectional overrides, and halves of surrogates.
+_UNSAFE = re.compile('[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]')
+
+
+def printable(text: str) -> str:
+    r"""
+    Return a text as one line that is safe to show: a terminal or viewer obeys nothing in it.
+
+    White space becomes blanks; other control characters, bidirectional overrides and lone surrogates are
+    escaped, e.g. as ``\x1b`` or ``\u202e``.
+    """
+    return _UNSAFE.sub(_escaped, text)
+
+
+def shortened(text: str, most: int = LONGEST) -> str:
+    """Return a text with at most `most` characters; if it is longer, an ellipsis replaces its middle."""
+    if len(text) <= most:
+        return text
+    tail = (most - 1) // 2
+    return f'{text[:most - 1 - tail]}…{text[len(text) - tail:]}'
+
+
+def told(text: str, most: int = LONGEST) -> str:
+    """Return a text that is both printable and short."""
+    # Twice: escaping megabytes would take long, and makes a text longer.
+    return shortened(printable(shortened(text, 2 * most)), most)
+
+
+def _escaped(match: re.Match[str]) -> str:
+    character = match[0]
+    if character.isspace():
+        return ' '
+    return f'\\x{ord(character):02x}' if ord(character) < 256 else f'\\u{ord(character):04x}'
+
 
 class DloCalibrationError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose; its text has at most 300 characters."""
+
+    def __str__(self) -> str:
+        return told(super().__str__())
 
 
 class InputError(DloCalibrationError):
@@ -15,7 +61,7 @@ class InputError(DloCalibrationError):
     An input that cannot be used.
 
     The message always answers the same four questions, so that its reader can act
-    without opening the code.
+    without opening the code.  Each answer is printable, and shortened if all together are too long.
 
     :param thing: which input, e.g. ``goal_chain stamped 12.5 s``.
     :param came: what was found in it.
@@ -24,18 +70,26 @@ class InputError(DloCalibrationError):
     """
 
     def __init__(self, thing: str, came: str, expected: str, remedy: str) -> None:
-        super().__init__(thing, came, expected, remedy)
-        self.thing = thing
-        self.came = came
-        self.expected = expected
-        self.remedy = remedy
+        self.thing, self.came, self.expected, self.remedy = parts = tuple(
+            map(told, (thing, came, expected, remedy)))
+        super().__init__(*parts)
 
     def __str__(self) -> str:
-        return f'{self.thing}: got {self.came}, expected {self.expected}; {self.remedy}'
+        form = '{}: got {}, expected {}; {}'
+        return form.format(*_fitting((self.thing, self.came, self.expected, self.remedy),
+                                     LONGEST - len(form.format(*[''] * 4))))
 
 
 class SimulationError(DloCalibrationError):
     """A trial that an engine cannot simulate, or a rollout that diverged."""
+
+
+def _fitting(parts: Sequence[str], most: int) -> list[str]:
+    """Return texts with at most `most` characters together; the longest ones are shortened."""
+    limit = max(map(len, parts))
+    while sum(min(len(part), limit) for part in parts) > most:
+        limit -= 1
+    return [shortened(part, limit) for part in parts]
 
 
 def unwritable(path: object, error: OSError, kind: str = 'file') -> InputError:

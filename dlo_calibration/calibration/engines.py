@@ -11,7 +11,7 @@ from multiprocessing import parent_process
 from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.options import AUTO, Options
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, printable
 from dlo_calibration.evaluation.apart import SimulatorApart
 from dlo_calibration.simulation.protocol import Simulator
 
@@ -56,7 +56,7 @@ def _settings(options: Options) -> dict[str, Any]:
 @functools.cache
 def _warn_once(text: str) -> None:
     """Log a warning, once per process."""
-    logging.getLogger(__name__).warning(text)
+    logging.getLogger(__name__).warning(printable(text))
 
 
 #: name -> constructor, which imports its engine only when called

@@ -11,9 +11,10 @@ recorded in a session are all generated from these declarations.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, Iterator, Mapping
+from difflib import get_close_matches
+from typing import Any, Iterator, Mapping, Sequence
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, shortened
 from dlo_calibration.evaluation.processes import ANSWER_LIMIT
 from dlo_calibration.model.parameters import (
     BY_NAME,
@@ -72,8 +73,7 @@ class Declaration:
         if self.choices:
             for one in value if kind is tuple else (value,):
                 if one not in self.choices:
-                    raise InputError(what, f'{one!r}', f'one of {", ".join(self.choices)}',
-                                     'choose one of them')
+                    raise InputError(what, f'{one!r}', _one_of(self.choices, one), 'choose one of them')
         low, high = self.minimum, self.maximum
         if kind in (int, float) and not (
                 (low is None or value >= low) and (high is None or value <= high)):
@@ -196,8 +196,16 @@ class Options:
 
 
 def _unknown(name: str) -> Any:
-    raise InputError('parameter', repr(name), f'one of {", ".join(d.name for d in declarations())}',
-                     'correct the name')
+    known = [declaration.name for declaration in declarations()]
+    raise InputError('parameter', repr(name), _one_of(known, name), 'correct the name')
+
+
+def _one_of(known: Sequence[str], name: str) -> str:
+    """Say that one of the known names was expected: all of them, or the nearest ones if there are many."""
+    if len(known) <= 8:  # they fit into an error
+        return f'one of {", ".join(known)}'
+    near = get_close_matches(shortened(name), known, n=3, cutoff=0)
+    return f'one of {", ".join(near)} or {len(known) - len(near)} others in doc/messages.md'
 
 
 FIXED_VALUES: Mapping[str, Declaration] = {

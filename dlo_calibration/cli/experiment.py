@@ -16,7 +16,7 @@ from dlo_calibration.calibration.options import MACHINE, names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.cli.output import print_json, standard_output, tell
 from dlo_calibration.cli.source import add_common_arguments, read_source
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, printable
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.conduct import conduct, Plan
 from dlo_calibration.experiment.study import Observed, Subject
@@ -120,7 +120,7 @@ def _command(chosen: argparse.Namespace, searches: Sequence[str]) -> str:
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Name the objects after their sessions; a name that is taken gets a number."""
-    names = [path.stem if path.suffix in ('.mcap', '.db3', '.xml') else path.resolve().name
+    names = [printable(path.stem if path.suffix in ('.mcap', '.db3', '.xml') else path.resolve().name)
              for path in paths]
     return [name if name not in names[:k] else f'{name}_{names[:k].count(name) + 1}'
             for k, name in enumerate(names)]

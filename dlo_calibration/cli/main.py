@@ -14,7 +14,7 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli import experiment, fit, info, plot, validate
 from dlo_calibration.cli.output import tell
-from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.errors import DloCalibrationError, printable
 from dlo_calibration.signals import exit_code
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
@@ -50,7 +50,7 @@ class _Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f'{self.prog}: {" ".join(message.split())}; see {self.prog} --help\n')
+        self.exit(2, f'{self.prog}: {printable(" ".join(message.split()))}; see {self.prog} --help\n')
 
 
 def _parser() -> argparse.ArgumentParser:

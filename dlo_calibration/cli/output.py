@@ -13,13 +13,13 @@ from typing import Any, Iterator, Mapping, Sequence, TextIO
 
 from dlo_calibration.calibration.plain import known, plain
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.errors import DloCalibrationError, printable
 
 
 def tell(text: str) -> None:
     """Print a line on stderr, if that is possible."""
     with suppress(OSError):  # where stderr is a file on a full disk, the work goes on
-        sys.stderr.write(f'{text}\n')
+        sys.stderr.write(f'{printable(text)}\n')
 
 
 def flush() -> None:

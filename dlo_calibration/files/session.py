@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Iterable
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, told
 from dlo_calibration.files.bag import Bag, decode, encode, Record
 from dlo_calibration.messages.codec import (
     action_trajectory,
@@ -28,6 +28,7 @@ from dlo_calibration.messages.codec import (
 )
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
+from dlo_calibration.messages.refusals import counted
 from dlo_calibration.model.trial import Trial
 
 
@@ -81,7 +82,7 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
 
 
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
-    """Return the complete trials of a session, and the reasons why messages are not used."""
+    """Return the complete trials of a session, and the reasons why messages are not used, each once."""
     collector = TrialCollector(options)
     usable, refusals = [], []
     for kind, message in session.messages:
@@ -96,7 +97,7 @@ def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...
             refusals.append(str(error))
         refusals += [str(refusal) for refusal in collector.take_news()]
     refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
-    return collector.trials, tuple(dict.fromkeys(refusals))
+    return collector.trials, counted(refusals)
 
 
 def read_session(path: str | Path, namespace: str | None = None) -> Session:
@@ -136,7 +137,7 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
     if late:
         problems.append(f'{late} message(s) before the last reset or after the last start are left out, '
                         'as the live calibration did not use them')
-    return Session(path, tuple(messages), records, source.options, tuple(problems))
+    return Session(path, tuple(messages), records, source.options, counted(map(told, problems)))
 
 
 def _input_topics(path: Path, records: Iterable[Record], namespace: str | None,

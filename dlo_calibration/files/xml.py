@@ -88,9 +88,15 @@ def parse(octets: bytes, where: str, schema: str) -> Any:
 
 
 def document(root: Any) -> bytes:
-    """Return the document with a root element, as UTF-8 bytes."""
+    """
+    Return the document with a root element, as UTF-8 bytes.
+
+    Characters that a terminal or an editor would obey stand there as references.
+    """
     etree.indent(root)
-    return bytes(etree.tostring(root, xml_declaration=True, encoding='UTF-8')) + b'\n'
+    text = etree.tostring(root, encoding='unicode')
+    text = re.sub('[\x7f-\x9f\u2028-\u202e\u2066-\u2069]', lambda match: f'&#{ord(match[0])};', text)
+    return f"<?xml version='1.0' encoding='UTF-8'?>\n{text}\n".encode()
 
 
 def write_octets(path: str | Path, octets: bytes) -> None:

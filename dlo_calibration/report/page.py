@@ -16,6 +16,7 @@ from typing import Any, Iterable, Mapping, Sequence
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import printable
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME
@@ -80,7 +81,8 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
                               autoescape=True, trim_blocks=True, lstrip_blocks=True,
-                              keep_trailing_newline=True)
+                              keep_trailing_newline=True,
+                              finalize=lambda value: printable(value) if type(value) is str else value)
     environment.filters.update(number=number, exact=exact, squared=lambda text: text.replace('m^2', 'm²'))
     environment.globals.update(measured=measured, interval=interval)
     values = plain(result)

@@ -8,17 +8,25 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Any, Iterable, Mapping, Sequence, TextIO
 
+from rich import markup
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import shortened, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report import sentences
+
+LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
+
+
+def escape(text: str) -> str:
+    """Return a text for a console, which obeys nothing in it; names of a session can be anything."""
+    return markup.escape(told(text, LONGEST_TEXT))
 
 
 def console(stream: TextIO) -> Console:
@@ -100,13 +108,13 @@ def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
         table.add_row(
             escape(name), number(row['value']), interval(row['lower'], row['upper'], '1'),
             escape(measured(row['physical_value'], unit)),
-            escape(interval(row['physical_lower'], row['physical_upper'], unit)), row['verdict'])
+            escape(interval(row['physical_lower'], row['physical_upper'], unit)), escape(row['verdict']))
     return table
 
 
 def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
     """Return a table of two columns."""
-    table = Table(title=title, show_header=False)
+    table = Table(title=escape(title), show_header=False)
     for fact in facts:
         table.add_row(*(escape(text) for text in fact))
     return table
@@ -114,7 +122,7 @@ def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
 
 def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """Return a table with a heading."""
-    table = Table(title=title)
+    table = Table(title=escape(title))
     for text in head:
         table.add_column(text)
     for row in rows:
@@ -167,14 +175,14 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     out.print(facts_table(about['session'], [
         ('trials', str(len(about['trials']))),
         ('duration', f"{number(about['duration_s'])} s"),
-        ('frame', ', '.join(map(repr, about['frames'])) or '-'),
+        ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
         *((topic, f'{count} messages') for topic, count in about['messages'].items()),
     ]))
     if about['trials']:
         head = ('name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')
         out.print(rows_table('trials', head, [
             (trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
-             ', '.join(f"{hand['name']} (points {' '.join(map(str, hand['grips']))})"
+             ', '.join(f"{shortened(hand['name'], 100)} (points {' '.join(map(str, hand['grips']))})"
                        for hand in trial['hands']),
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
              f"{number(trial['duration_s'])} s",

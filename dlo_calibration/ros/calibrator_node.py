@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, printable
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.parameters import OptionsNode
@@ -64,7 +64,7 @@ def spin(args: Sequence[str], should_stop: Callable[[], bool],
         pass
     # rclpy raises the last two for a bad command line, and has no public names for them.
     except (InputError, rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
-        sys.stderr.write(f'calibrator: {" ".join(str(error).split())}\n')
+        sys.stderr.write(f'calibrator: {printable(" ".join(str(error).split()))}\n')
         return 2
     finally:
         if executor is not None:
@@ -214,12 +214,17 @@ class CalibratorNode(OptionsNode):
 
     def info(self, text: str) -> None:
         """Log a text."""
-        self.get_logger().info(text)
+        self.get_logger().info(_lines(text))
 
     def warn(self, text: str) -> None:
         """Log a warning."""
-        self.get_logger().warning(text)
+        self.get_logger().warning(_lines(text))
 
     def error(self, text: str) -> None:
         """Log an error."""
-        self.get_logger().error(text)
+        self.get_logger().error(_lines(text))
+
+
+def _lines(text: str) -> str:
+    """Return the lines of a text, each printable: what came from outside stands in some of them."""
+    return '\n'.join(map(printable, text.split('\n')))

@@ -10,6 +10,7 @@ from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import printable
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import MessageTypes
@@ -118,7 +119,7 @@ def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> An
 
 
 def _status(types: MessageTypes, level: int, name: str, message: str, values: Mapping[str, Any]) -> Any:
-    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=exact(value))
+    pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=printable(exact(value)))
              for key, value in values.items()]
     return types.build('diagnostic_msgs/msg/DiagnosticStatus', level=types.level(level), name=name,
-                       message=message, hardware_id='', values=pairs)
+                       message=printable(message), hardware_id='', values=pairs)

@@ -21,12 +21,13 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
-from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.errors import DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import KEPT, TrialCollector
+from dlo_calibration.messages.refusals import Refusals
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
@@ -105,6 +106,7 @@ class _Memory:
 
     :param detail: about the state, e.g. why the calibration failed.
     :param refusals: the latest ones, which are not reported again.
+    :param counted: the same, by their reason.
     :param heard: time of the last action or goal chain [s].
     :param started: whether a calibration was started, so that `start_after_trials` starts none.
     :param status: content of the last ``~/status``.
@@ -116,6 +118,7 @@ class _Memory:
     detail: str = ''
     last_refusal: str = ''
     refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
+    counted: Refusals = field(default_factory=Refusals)
     heard: float = float('-inf')
     started: bool = False
     status: dict[str, Any] = field(default_factory=dict)
@@ -180,11 +183,11 @@ class CalibrationSession:
                 memory.state, memory.detail = 'collecting', ''
 
     def refuse(self, text: str) -> None:
-        """Tell why something was refused, in the log and in ``~/status``."""
-        self._memory.last_refusal = text
-        self._memory.refusals.append(text)
-        self._graph.warn(text)
-        self._report()
+        """Tell why something was refused, in the log and in ``~/status``; a repeated reason not each time."""
+        text, memory = told(text), self._memory
+        memory.refusals.append(text)
+        memory.last_refusal = memory.counted.add(text)
+        self._tell_refusals(memory.counted.due(self._clock()))
 
     def request(self, name: str) -> tuple[bool, str]:
         """Serve a request `start`, `stop` or `reset`; return whether that succeeded, and the answer."""
@@ -201,6 +204,7 @@ class CalibrationSession:
         """Do what is due now; the node calls this many times a second."""
         self._take_events()
         self._recorder.tell()
+        self._tell_refusals(self._memory.counted.due(self._clock()))
         self._start_by_itself()
         self._appraise()
         # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
@@ -212,7 +216,7 @@ class CalibrationSession:
 
     def fail(self, text: str, *log: str) -> None:
         """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
-        self._memory.state, self._memory.detail = 'failed', text
+        self._memory.state, self._memory.detail = 'failed', told(text)
         for line in log or (text,):
             self._graph.error(line)
         self._report()
@@ -225,6 +229,7 @@ class CalibrationSession:
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
                 self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
+            self._tell_refusals(self._memory.counted.rest())
         finally:
             self._recorder.close()
 
@@ -283,6 +288,7 @@ class CalibrationSession:
         self._appraiser.stop()
         self._collected_with = self._graph.options()
         self._collector = TrialCollector(self._collected_with)
+        self._tell_refusals(self._memory.counted.rest())
         self._memory = _Memory()
         self._begin_recording()
         self._show()
@@ -293,7 +299,7 @@ class CalibrationSession:
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():
             if isinstance(event, Notice):
-                self._memory.detail = event.text
+                self._memory.detail = told(event.text)
                 self._graph.warn(event.text)
             elif not isinstance(event, Evaluation):
                 self._finish(event)
@@ -379,6 +385,12 @@ class CalibrationSession:
         self._recorder.begin(self._graph.options())
         if self._recorder.folder is not None:
             self._graph.info(f'recording to {self._recorder.folder}')
+
+    def _tell_refusals(self, texts: list[str]) -> None:
+        for text in texts:
+            self._graph.warn(text)
+        if texts:
+            self._report()
 
     def _fail_to_record(self, text: str) -> None:
         self._memory.last_refusal = text

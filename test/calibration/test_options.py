@@ -91,12 +91,15 @@ def test_only_choices_can_be_chosen(name):
         assert Options.of({name: value}).flat()[name] == value
     with pytest.raises(InputError) as refusal:
         Options.of({name: [declaration.choices[0], 'nonsense'] if several else 'nonsense'})
-    assert f"parameter {name}: got 'nonsense', expected one of {', '.join(declaration.choices)}" \
-        in str(refusal.value)
+    text = str(refusal.value)
+    assert f"parameter {name}: got 'nonsense', expected one of " in text
+    if len(declaration.choices) < 8:
+        assert ', '.join(declaration.choices) in text
+    assert len(text) < 300
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="parameter: got 'evalutions', expected one of mass, table, "):
+    with pytest.raises(InputError, match="parameter: got 'evalutions', expected one of evaluations, "):
         Options.of({'evalutions': 10})
     with pytest.raises(InputError, match="parameter: got 'values'"):
         Options.of({'values': {}})

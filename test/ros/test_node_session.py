@@ -13,6 +13,7 @@ import pytest
 from result_message import result_values
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
+from wrong_input import with_point
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
@@ -21,7 +22,7 @@ from dlo_calibration.files.bag import encode
 from dlo_calibration.files.recording import typestore
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import bag_types, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.codec import bag_types, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.quantity import number
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.session import CalibrationSession
@@ -225,6 +226,31 @@ def test_what_is_refused_is_told_once_and_the_trials_stay(start, octets, words):
     assert graph.logged['warn'] == [graph.status['last_refusal']]
     assert whole(graph.calibrated())['trials'] == '1'
     assert graph.logged['warn'].count(graph.status['last_refusal']) == 1
+
+
+@pytest.mark.parametrize('text', ['\x1b[2J\x9b31m\u202etxt.exe\r\n\ud800', 5_000_000 * 'x'])
+def test_log_and_status_are_harmless_and_short_whatever_came(start, text):
+    graph = start()
+    graph.session.refuse(text)
+    refusal = graph.status['last_refusal']
+    assert graph.logged['warn'] == [refusal]
+    graph.session.fail(text, 'in the log')
+    for one in (refusal, graph.status['detail']):
+        assert 0 < len(one) <= 300 and one.isprintable()
+
+
+def test_what_is_refused_for_one_reason_is_counted(start):
+    graph = start()
+    bad = with_point(4, float('nan'))(TYPES)
+    for k in range(37):
+        bad.header.stamp.sec = 200 + k
+        graph.send([(GOAL, bad)])
+    assert graph.status['last_refusal'].startswith('goal_chain stamped 236 s: ')
+    assert graph.status['last_refusal'].endswith(' (37 times)')
+    assert len(graph.logged['warn']) == 1
+    graph.ahead = 2.0
+    graph.session.tick()
+    assert graph.logged['warn'][1:] == [graph.status['last_refusal']]
 
 
 def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is refused is told in a short, harmless line, and a reason that repeats is counted."""
+
+import copy
+import pickle
+import unicodedata
+
+from hypothesis import given
+from hypothesis import strategies as st
+from toy_messages import MINUTE, SECOND, session_messages, write_session
+from toy_simulator import new_toy
+from wrong_input import action, cloud, with_point
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.cli.main import main
+from dlo_calibration.errors import InputError, printable, SimulationError
+from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.messages.codec import ACTION, bag_types, GOAL
+from dlo_calibration.messages.refusals import counted, MOST_REASONS, Refusals
+
+TYPES = bag_types()
+HOSTILE = '\x1b]0;owned\x07\x1b[2J\x9b31m‮txt.exe\r\n$ fake\ud800'
+
+
+def harmless(text):
+    """Tell whether a terminal only shows a text: no control, format or surrogate character, and one line."""
+    return not any(unicodedata.category(one) in ('Cc', 'Cs', 'Zl', 'Zp') or one in '\u202a\u202b\u202d\u202e'
+                   for one in text)
+
+
+def test_what_a_terminal_would_obey_is_shown_as_an_escape():
+    assert printable('a\x1b[2Jb\x9bc\u202ed\ud800e') == r'a\x1b[2Jb\x9bc\u202ed\ud800e'
+    assert printable('two\r\nlines\tand a blank') == 'two  lines and a blank'
+    assert printable('flexibilité, 柔軟さ, 🪢 \u2026') == 'flexibilité, 柔軟さ, 🪢 \u2026'
+
+
+@given(st.lists(st.text(max_size=400), min_size=4, max_size=4))
+def test_an_error_is_one_short_line_whatever_came(parts):
+    error = InputError(*parts)
+    for one in (error, SimulationError(''.join(parts)), copy.copy(error)):
+        assert len(str(one)) <= 300
+        assert harmless(str(one))
+
+
+def test_of_a_refusal_that_is_too_long_the_thing_and_the_remedy_survive():
+    text = str(InputError('goal_chain stamped 12.5 s', f"frame_id '{5_000_000 * 'x'}'", "'world'", 'reset'))
+    assert text.startswith("goal_chain stamped 12.5 s: got frame_id 'xxx")
+    assert text.endswith("xxx', expected 'world'; reset")
+    assert '…' in text and len(text) == 300
+
+
+def test_an_error_does_not_keep_the_megabytes_that_came():
+    error = InputError('thing', 5_000_000 * 'x', 'less', 'shorten it')
+    assert len(error.came) <= 300 and len(pickle.dumps(error)) < 1000
+
+
+def test_one_reason_many_times_is_one_line_with_its_first_stamp():
+    texts = [f'goal_chain stamped {k}.5 s: got NaN in point {k}' for k in range(100)]
+    assert counted([*texts, "frame 'a'", "frame 'b\\'c'", 'something else']) == (
+        'goal_chain stamped 0.5 s: got NaN in point 0 (and 99 more like it)',
+        "frame 'a' (and 1 more like it)",
+        'something else')
+
+
+def test_reasons_without_end_are_told_in_a_limited_number_of_lines():
+    texts = [f'{"x" * k} is wrong' for k in range(1, 5000)]
+    assert len(counted(texts)) == MOST_REASONS + 1
+    refusals = Refusals()
+    for text in texts:
+        refusals.add(text)
+    assert len(refusals.due(0.0)) == MOST_REASONS + 1
+
+
+def test_a_repeated_refusal_is_told_at_once_then_at_growing_intervals_and_never_lost():
+    refusals, told = Refusals(), []
+    for k in range(3000):  # at 10 Hz
+        refusals.add(f'goal_chain stamped {k} s: bad')
+        told += [(k / 10, text) for text in refusals.due(k / 10)]
+    assert told[0] == (0.0, 'goal_chain stamped 0 s: bad')
+    assert told[1] == (1.0, 'goal_chain stamped 10 s: bad (11 times)')
+    assert [round(when) for when, _ in told] == [0, 1, 3, 7, 15, 31, 63, 123, 183, 243]
+    refusals.add('another reason')
+    assert refusals.due(300.0) == ['another reason']
+    assert refusals.rest() == ['goal_chain stamped 2999 s: bad (3000 times)']
+    assert refusals.rest() == []
+
+
+def test_session_with_thousands_of_bad_messages_is_told_in_one_line_for_each_reason(tmp_path, capsys):
+    bad = [(GOAL, with_point(4, float('nan'))(TYPES)) for _ in range(300)]
+    for k, (_, message) in enumerate(bad):
+        message.header.stamp.sec = 200 + k
+    path = write_session(tmp_path / 'session', [*session_messages(TYPES, 1), *bad])
+    refusal, = session_trials(read_session(path), Options())[1]
+    assert refusal.startswith('goal_chain stamped 200 s: ') and refusal.endswith(' (and 299 more like it)')
+    assert main(['info', str(path)], new_toy) == 0
+    assert len(capsys.readouterr().out.splitlines()) < 30
+
+
+def test_hostile_names_are_only_shown(tmp_path, capsys):
+    name = HOSTILE.replace('\ud800', '')  # CDR has no lone surrogates
+    good = session_messages(TYPES, 1)
+    for kind, message in good:
+        message.header.frame_id = name
+        if kind == ACTION:
+            message.joint_names = [name]
+    foreign = cloud(stamp=2 * MINUTE + SECOND, frame=name + 'other')(TYPES)
+    far = action(stamp=2 * MINUTE + 2 * SECOND, frame=name, names=(f'{name}2',), away=5.0)(TYPES)
+    path = write_session(tmp_path / f'session{name}', [*good, (GOAL, foreign), (ACTION, far)])
+    for arguments in (['info', str(path)], ['fit', str(path), '--evaluations', '20', '--workers', '1'],
+                      ['fit', f'{path}.mcap']):
+        main(arguments, new_toy)
+        shown = capsys.readouterr()
+        for line in (shown.out + shown.err).split('\n'):
+            assert harmless(line), repr(line)
+    assert main(['info', str(path)], new_toy) == 0
+    assert r'\x1b]0;owned\x07' in capsys.readouterr().out
