@@ -37,7 +37,7 @@ from dlo_calibration.files.xml import (
     refused,
     write_octets,
 )
-from dlo_calibration.model.action import Action, Hand, NO_ROTATION
+from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
 from dlo_calibration.model.trial import Goal, Trial
@@ -274,7 +274,10 @@ def _trial(where: str, element: Any) -> TrialRequest:
 
 def _goal(where: str, element: Any) -> GoalRequest:
     held_by = element.get('held_by')
-    return GoalRequest(read_chain(where, element), number(where, element, 'time'),
+    time = number(where, element, 'time')
+    if abs(time) > MAXIMUM_TIME:
+        raise refused(where, element, f'a time of {time:g} s', f'at most {MAXIMUM_TIME:g} s')
+    return GoalRequest(read_chain(where, element), time,
                        element.get('stable', 'true') == 'true',
                        None if held_by is None else tuple(held_by.split()))
 

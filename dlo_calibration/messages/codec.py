@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import far_from_unit, MAXIMUM_HANDS, quaternion_lengths
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
 INPUT_TYPES: Mapping[str, str] = {
@@ -27,7 +27,6 @@ INPUT_TYPES: Mapping[str, str] = {
 NANOSECONDS = 10**9  # in a second
 MAXIMUM_POINTS = 10_000  # of a chain; a camera image sent by mistake has more
 MAXIMUM_WAYPOINTS = 100_000  # of an action; a quarter of an hour at 100 Hz
-MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more
 MINIMUM_STEP = 1e-6  # s between waypoints; seconds since 1970 as float64 resolve 0.2 us
 MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start is longer
 UINT8, FLOAT32, FLOAT64 = 2, 7, 8  # datatypes of sensor_msgs/PointField
@@ -47,16 +46,6 @@ def _check_stamp(kind: str, stamp: int) -> None:
     if stamp <= 0:
         raise InputError(named(kind, stamp), 'a stamp of zero' if stamp == 0 else 'a negative stamp',
                          'the time of the observation', 'set header.stamp')
-
-
-def _check_size(thing: str, what: str, positions: Floats) -> None:
-    """Refuse finite but huge coordinates [m], whose squares overflow; `positions` is (n, ...)."""
-    rows = positions.reshape(len(positions), positions[:1].size)
-    bad = np.argwhere(np.isfinite(rows) & (np.abs(rows) > MAXIMUM_COORDINATE))
-    if len(bad):
-        raise InputError(thing, f'a coordinate of {rows[tuple(bad[0])]:g} m in {what} {bad[0][0]}',
-                         f'at most {MAXIMUM_COORDINATE:g} m',
-                         'send metres, in the byte order that is_bigendian names')
 
 
 @dataclass(frozen=True)
@@ -133,7 +122,7 @@ class ActionMessage:
             if len(bad):
                 raise InputError(thing, f'NaN or infinity in {name} of trajectory point {bad[0]}',
                                  'finite numbers', 'leave such points out')
-        _check_size(thing, 'trajectory point', positions)
+        check_size(thing, 'trajectory point', positions)
         if times[0] < 0 or times[-1] > MAXIMUM_DURATION:
             raise InputError(thing, f'time_from_start from {times[0]:g} to {times[-1]:g} s',
                              f'0 to {MAXIMUM_DURATION:g} s', 'count time_from_start from header.stamp')
@@ -213,7 +202,6 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
         raise InputError(thing, f'hand {hands.max()}', f'0 for none, or 1 to {MAXIMUM_HANDS}',
                          'number the hands as in joint_names of the action')
     points = np.stack([table[name].astype(float) for name in COORDINATES], axis=1)
-    _check_size(thing, 'point', points)
     try:
         chain = Chain(points, hands, features)  # type: ignore[arg-type]
     except InputError as error:

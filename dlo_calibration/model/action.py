@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import check_size, Floats, frozen_array
 
 MAXIMUM_HANDS = 8  # the limit of the message contract
+MAXIMUM_TIME = 1e12  # s; far more than between two stamps, and steps up to it can be counted
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)  # x y z w
 
 
@@ -41,7 +42,7 @@ class Hand:
     :param name: its name in the messages, e.g. ``left_hand``.
     :param grips: indices of the gripped points of the chain, at least one.
     :param times: (k,) seconds since the start of the trial, increasing, k >= 1.
-    :param positions: (k, 3) [m].
+    :param positions: (k, 3) [m], at most `MAXIMUM_COORDINATE`.
     :param orientations: (k, 4) unit quaternions x y z w; None for no rotation.
     """
 
@@ -68,6 +69,10 @@ class Hand:
         if not (np.isfinite(times).all() and np.isfinite(positions).all()
                 and np.isfinite(orientations).all()):
             raise InputError(thing, 'NaN or infinity in its path', 'finite numbers', 'correct the path')
+        check_size(thing, 'waypoint', positions)
+        if np.abs(times).max() > MAXIMUM_TIME:
+            raise InputError(thing, f'a waypoint at {times[np.abs(times).argmax()]:g} s',
+                             f'at most {MAXIMUM_TIME:g} s', 'count seconds from the start of the trial')
         if (np.diff(times) <= 0).any():
             raise InputError(thing, 'waypoints whose times do not increase', 'increasing times',
                              'sort the waypoints and remove repeated ones')

@@ -15,6 +15,7 @@ from dlo_calibration.errors import InputError
 
 Floats = NDArray[np.float64]
 
+MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more, and squares must not overflow
 MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
 SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
 
@@ -24,6 +25,24 @@ def frozen_array(values: ArrayLike, dtype: type = float) -> NDArray[Any]:
     array: NDArray[Any] = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
+
+
+def check_size(thing: str, what: str, positions: Floats) -> None:
+    """
+    Refuse finite but huge coordinates.
+
+    :param thing: that has them, in the error.
+    :param what: one of the `positions`, (n, ...) [m], is called.
+    :raises InputError: if a coordinate is larger than MAXIMUM_COORDINATE.
+    """
+    if np.abs(positions).max(initial=0.0) <= MAXIMUM_COORDINATE:
+        return
+    rows = positions.reshape(len(positions), positions[:1].size)
+    bad = np.argwhere(np.isfinite(rows) & (np.abs(rows) > MAXIMUM_COORDINATE))
+    if len(bad):
+        raise InputError(thing, f'a coordinate of {rows[tuple(bad[0])]:g} m in {what} {bad[0][0]}',
+                         f'at most {MAXIMUM_COORDINATE:g} m',
+                         'send metres, in a message in the byte order that is_bigendian names')
 
 
 def bezier_curve(knots: Floats, values: Floats, at: Floats) -> Floats:
@@ -68,7 +87,8 @@ class Chain:
     """
     Ordered points along a DLO, first to last.
 
-    :param points: (n, 3) positions [m], n >= 3, finite, neighbours apart.
+    :param points: (n, 3) positions [m], n >= 3, finite, at most
+        MAXIMUM_COORDINATE, neighbours apart.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
         None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.
@@ -88,6 +108,7 @@ class Chain:
             raise InputError(
                 'chain', f'{len(points)} point(s)', 'at least 3',
                 'send the points along the whole DLO, first to last')
+        check_size('chain', 'point', points)
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
             raise InputError(

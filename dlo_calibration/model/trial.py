@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 
 
@@ -30,6 +30,11 @@ class Goal:
     time: float
     stable: bool = True
     held_by: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not abs(self.time) <= MAXIMUM_TIME:
+            raise InputError('goal chain', f'a time of {self.time:g} s', f'at most {MAXIMUM_TIME:g} s',
+                             'count seconds from the start of the trial')
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from typing import Protocol, Sequence
 
 import numpy as np
 
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
@@ -28,6 +29,8 @@ from dlo_calibration.simulation.protocol import advanced, Rollout
 
 CHECKS = 5  # of the displacement within one `Settling.time`
 PIECE = 1000  # steps in one call of a stepper: at most some seconds, even with 1000 nodes
+MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
+MOST_KEPT_STEPS = 20_000  # of a path that is kept for the next parameter set: 2 MB
 ROUNDING = 1e-9  # s; instants that differ by less are the same
 
 
@@ -196,7 +199,11 @@ class _Course:
             nodes = self._layout.nodes(hand)
             step = self._stepper.time_step
             count = max(1, math.ceil((hand.end - self._time) / step - ROUNDING))
-            positions, turns = _poses(hand, self._time, step, count)
+            if count > MOST_STEPS:
+                raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
+                                      f'more than {MOST_STEPS}; divide its path into several actions')
+            poses = _poses if count <= MOST_KEPT_STEPS else _poses.__wrapped__
+            positions, turns = poses(hand, self._time, step, count)
             offsets = self._stepper.points[list(nodes)] - positions[0]
             path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:], offsets)
             self._grips.pop(hand.name, None)

@@ -231,6 +231,7 @@ TEXT = request(LiftAndHold(point=1), PushDown(point=0, start=20.0), PATHS,
     ('<waypoint time="1.0"', '<waypoint', "<waypoint>.*'time'"),
     ('<waypoint time="1.0"', '<waypoint time="1.0" qx="0"', '<waypoint>.*only qx'),
     ('<goal_chain time="60.0"', '<goal_chain', "<goal_chain>.*'time'"),
+    ('<goal_chain time="60.0"', '<goal_chain time="1e300"', '<goal_chain>.*a time of 1e.300 s'),
     ('<goal_chain time="60.0"', '<goal_chain time="60.0" held_by="a" colour="x"', '<goal_chain>.*colour'),
     ('stable="true"', 'stable="maybe"', '<goal_chain>.*stable.*maybe'),
 ])
@@ -249,6 +250,9 @@ def test_what_is_wrong_is_refused_by_its_line(old, new, match):
     ('grips="0 1"', 'grips="0 9"', "<trial>.*'left_hand' gripping points"),
     ('point="0"', 'point="9"', '<trial>.*push_down.*point 9.*-4 to 3'),
     ('<point x="0.6"', '<point x="0.4"', '<initial_chain>.*coincident'),
+    ('<point x="0.6"', '<point x="1e9"', '<initial_chain>.*1e.09 m in point .*at most 1e.08 m'),
+    ('<waypoint time="1.0"', '<waypoint time="1e300"', '<hand>.*a waypoint at 1e.300 s'),
+    ('<waypoint time="1.0" x="', '<waypoint time="1.0" x="9999999999', '<hand>.*in waypoint 0.*1e.08 m'),
     ('name="table" value="false"', 'name="mass" value="1"', '<settings>.*mass.*<object>'),
     ('time="60.0"', 'time="1.5"', '<trial>.*stable goal.*moves'),
 ])

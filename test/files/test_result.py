@@ -167,6 +167,7 @@ def test_unexpected_is_refused_by_line_and_element(file, change, match):
 
 @pytest.mark.parametrize('change, match', [
     (('<point x="0.0"', '<point hand="1" x="0.0"'), '<point>.*hand'),
+    (('<point x="0.0"', '<point x="1e9"'), '<chain>.*1e.09 m in point 0'),
     (('<fit ', '<hunt '), 'no XML document|<hunt>'),
     (('<fixed name="damping"', '<fixed name="friction"'), '<fixed>.*friction.*twice'),
     (('<fixed name="damping"', '<fixed name="weight"'), 'weight'),

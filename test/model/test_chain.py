@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from dlo_calibration import Chain, InputError
+from dlo_calibration import Chain, Goal, Hand, InputError
 from dlo_calibration.model.chain import bezier_curve, interpolation_matrix
 
 LINE = np.array([[0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
@@ -159,3 +159,23 @@ def test_refusals_say_what_came_what_was_expected_and_what_to_do(name):
 def test_many_bad_points_are_counted_not_listed():
     with pytest.raises(InputError, match=r'point\(s\) 0, 1, 2, 3, 4 and 95 more'):
         Chain(np.full((100, 3), np.nan))
+
+
+@pytest.mark.parametrize('far', [1.1e8, -1e300])
+def test_coordinates_that_cannot_be_metres_are_refused(far):
+    points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    assert len(Chain(points + 0.9e8)) == 3
+    points[1, 2] = far
+    with pytest.raises(InputError, match='a coordinate of .* m in point 1, expected at most 1e.08 m'):
+        Chain(points)
+    with pytest.raises(InputError, match='a coordinate of .* m in waypoint 1, expected at most 1e.08 m'):
+        Hand('left', (0,), np.arange(3.0), points)
+
+
+@pytest.mark.parametrize('time', [1e300, -1e13, float('nan')])
+def test_times_that_no_clock_gives_are_refused(time):
+    chain = Chain(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]))
+    with pytest.raises(InputError):
+        Goal(chain, time)
+    with pytest.raises(InputError):
+        Hand('left', (0,), np.array([time]), np.zeros((1, 3)))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from dlo_calibration import Action, Chain, Goal, Hand, Trial
+from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rollout import roll_out, Settling
 
@@ -264,3 +264,8 @@ def test_chains_have_the_observed_points_however_many_nodes_there_are():
         rollout = rolled([hand(4, 0.0, 1.0)], [resting(2.0)], until=1.0, nodes=nodes)
         assert rollout.chains.shape == (1, 11, 3)
         assert rollout.chains[0, :, 0] == pytest.approx(POINTS[:, 0], abs=1e-9)
+
+
+def test_a_path_that_does_not_fit_in_the_memory_is_refused():
+    with pytest.raises(SimulationError, match="hand 'left' moves for .* time steps, more than"):
+        rolled([hand(0, 0.0, 1e11)], [resting(1.5e11)])
