@@ -18,6 +18,7 @@ import sys
 
 from drawings import leave_out_drawings
 import pytest
+from serial import serial
 from toy_simulator import ToySimulator
 from wire import SOURCES
 
@@ -135,7 +136,7 @@ def command(capsys):
     def act(*words):
         capsys.readouterr()
         try:
-            code = cli.main([str(word) for word in words], lambda _: ToySimulator())
+            code = cli.main(serial(words), lambda _: ToySimulator())
         except SystemExit as end:  # argparse
             code = end.code
         output, errors = capsys.readouterr()

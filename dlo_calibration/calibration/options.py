@@ -32,6 +32,8 @@ AUTO = 'auto'  # engine: the fastest one that supports the options; the confirmi
 CONFIRMING = 'bullet'
 
 #: What an option describes: how trials were observed; what is searched and simulated; the user's machine.
+#: Files never set those of the machine (`file_options`). The mass belongs to the search, though it was
+#: measured: `validate` takes it from the result, as all physical values are in proportion to it.
 OBSERVATION, SEARCH, MACHINE = 'observation', 'search', 'machine'
 
 
@@ -42,17 +44,17 @@ class Declaration:
 
     :param default: also gives the type of the option: bool, int, float, str, or tuple of str.
     :param choices: the permitted values of a str, or of each str of a tuple.
-    :param of: OBSERVATION, SEARCH, or MACHINE, which does not affect the result.
+    :param of: OBSERVATION, SEARCH, or MACHINE, which does not affect the result, and which no file sets.
     """
 
     name: str
     default: Any
     description: str
+    of: str
     unit: str = ''
     minimum: float | None = None
     maximum: float | None = None
     choices: tuple[str, ...] = ()
-    of: str = SEARCH
 
     def checked(self, value: Any) -> Any:
         """
@@ -83,8 +85,8 @@ class Declaration:
         return value
 
 
-def _option(default: Any, description: str, **rest: Any) -> Any:
-    return field(default=default, metadata={'description': description, **rest})
+def _option(default: Any, description: str, of: str, **rest: Any) -> Any:
+    return field(default=default, metadata={'description': description, 'of': of, **rest})
 
 
 @dataclass(frozen=True)
@@ -99,29 +101,31 @@ class Options:
 
     mass: float = _option(
         0.0, 'mass of the whole DLO; 0: unknown, so a density is assumed and stiffness is reported '
-        'relative to weight', unit='kg', minimum=0.0, maximum=1000.0)
+        'relative to weight', unit='kg', minimum=0.0, maximum=1000.0, of=SEARCH)
     table: bool = _option(True, 'whether there is a table', of=OBSERVATION)
     table_height: float = _option(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0,
                                   of=OBSERVATION)
     scene: str = _option(
         '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
-        'relative to the working directory; empty: no obstacles', of=OBSERVATION)
+        'relative to the working directory; a session or document can name only a file in its own folder; '
+        'empty: no obstacles', of=OBSERVATION)
     calibrate: tuple[str, ...] = _option(
         PAPER_PARAMETERS, 'names of the parameters to find; all others keep their fixed value',
-        choices=tuple(BY_NAME))
+        choices=tuple(BY_NAME), of=SEARCH)
     parts: int = _option(
         1, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
         'cross-validation; if flexibility is calibrated, so is the stiffness of every part; a higher '
-        'part that calibrate names raises the number', minimum=0, maximum=MOST_PARTS)
+        'part that calibrate names raises the number', minimum=0, maximum=MOST_PARTS, of=SEARCH)
     search: str = _option('least_squares', 'method that chooses the parameter sets to try',
-                          choices=tuple(SEARCHES))
+                          choices=tuple(SEARCHES), of=SEARCH)
     evaluations: int = _option(
         150, "largest number of parameter sets to try (the paper's rounds)", minimum=1,
-        maximum=1000000)
-    seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1)
+        maximum=1000000, of=SEARCH)
+    seed: int = _option(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1,
+                        of=SEARCH)
     engine: str = _option(
         AUTO, 'simulation engine; auto: search with compiled and confirm the result with bullet, or use '
-        'bullet alone if there is a scene', choices=(AUTO, CONFIRMING, 'compiled'))
+        'bullet alone if there is a scene', choices=(AUTO, CONFIRMING, 'compiled'), of=SEARCH)
     workers: int = _option(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
                            of=MACHINE)
     scheduler: str = _option(
@@ -131,16 +135,16 @@ class Options:
         ANSWER_LIMIT, 'time without a sign of life after which a process that simulates is replaced and its '
         'evaluation is repeated', unit='s', minimum=1.0, maximum=86400.0, of=MACHINE)
     nodes: int = _option(DEFAULT_NODES, 'number of point masses of the simulated DLO', minimum=8,
-                         maximum=1000)
+                         maximum=1000, of=SEARCH)
     time_step: float = _option(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,
-                               maximum=0.02)
+                               maximum=0.02, of=SEARCH)
     stable_distance: float = _option(
         0.0005, 'the DLO is stable when all its nodes moved less than this within stable_time',
-        unit='m', minimum=1e-6, maximum=0.1)
+        unit='m', minimum=1e-6, maximum=0.1, of=SEARCH)
     stable_time: float = _option(0.25, 'time over which stable_distance is measured', unit='s',
-                                 minimum=0.01, maximum=60.0)
+                                 minimum=0.01, maximum=60.0, of=SEARCH)
     settle_limit: float = _option(10.0, 'simulated time after which waiting for a stable DLO ends',
-                                  unit='s', minimum=0.1, maximum=600.0)
+                                  unit='s', minimum=0.1, maximum=600.0, of=SEARCH)
     grip_tolerance: float = _option(
         0.02, 'an action without annotated grip is refused if no point is this near to the hand',
         unit='m', minimum=0.0, maximum=10.0, of=OBSERVATION)
@@ -213,7 +217,7 @@ FIXED_VALUES: Mapping[str, Declaration] = {
         p.name, p.default, f'{p.description}: {p.quantity} from {measured(p.at_zero, p.unit)} (at 0) to '
         f'{measured(p.at_hundred, p.unit)} (at 100), {"linear" if p.linear else "logarithmic"}; '
         'used if it is not calibrated',
-        minimum=0.0, maximum=SCALE)
+        of=SEARCH, minimum=0.0, maximum=SCALE)
     for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg
 
 

@@ -9,9 +9,10 @@ import argparse
 from pathlib import Path
 import shlex
 import sys
-from typing import Any, Mapping, Sequence
+from typing import Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.options import MACHINE, names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.cli.output import print_json, standard_output, tell
@@ -91,14 +92,14 @@ def _plan(chosen: argparse.Namespace) -> Plan:
         own = _observed(chosen, path)
         held = () if others else tuple(one - 1 for one in dict.fromkeys(
             chosen.held_back or range(1, len(own.trials) + 1)))
-        judges = _observed(chosen, others[k], own.options.flat()) if others else None
+        judges = _observed(chosen, others[k], FileOptions(own.options.flat())) if others else None
         subjects.append(Subject(name, own, held, judges))
     options = subjects[0].observed.options
     return Plan(tuple(subjects), searches, chosen.runs, options.seed, options.evaluations, options.workers,
                 _command(chosen, searches), samples=not chosen.sessions)
 
 
-def _observed(chosen: argparse.Namespace, path: Path, of_result: Mapping[str, Any] | None = None) -> Observed:
+def _observed(chosen: argparse.Namespace, path: Path, of_result: FileOptions | None = None) -> Observed:
     """Return the trials of a session, with the options to use on them."""
     source = read_source(chosen, lambda text: tell(f'{path}: {text}'), of_result, path).require_trials()
     same = {**Options().flat(), **given_options(chosen)}

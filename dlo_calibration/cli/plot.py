@@ -39,7 +39,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
                          'name a result: dlo-calibration plot SESSION RESULT.xml --animation')
     file = None if chosen.result is None else read_result(chosen.result)
-    source = read_source(chosen, tell, None if file is None else file.options).require_trials()
+    source = read_source(chosen, tell, None if file is None else file.file_options).require_trials()
     result = None if file is None else validated(file, source.trials, source.options, make_simulator)
     pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell)
     animations: list[Path] = []

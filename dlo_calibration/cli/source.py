@@ -8,8 +8,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Mapping
+from typing import Any, Callable
 
+from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.errors import InputError
@@ -25,12 +26,14 @@ class Source:
 
     :param session: as recorded; for a request, a session without messages.
     :param refusals: one text for each message that is not used, with the reason.
+    :param refusal: why the scene in a file is not among the options; without it, nothing is simulated.
     """
 
     session: Session
     options: Options
     trials: tuple[Trial, ...]
     refusals: tuple[str, ...]
+    refusal: InputError | None = None
 
     @property
     def path(self) -> Path:
@@ -44,10 +47,12 @@ class Source:
 
     def require_trials(self) -> Source:
         """
-        Return this source if it has a trial.
+        Return this source if it can be simulated.
 
-        :raises InputError: if it has none.
+        :raises InputError: if it has no trial, or if a scene is refused.
         """
+        if self.refusal is not None:
+            raise self.refusal
         if not self.trials:
             raise InputError(f'session {self.path}', 'no complete trial',
                              'an initial_chain, an action and a goal_chain, in the order of their stamps',
@@ -75,7 +80,7 @@ def is_request(path: Path) -> bool:
 
 
 def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
-                of_result: Mapping[str, Any] | None = None, path: Path | None = None) -> Source:
+                of_result: FileOptions | None = None, path: Path | None = None) -> Source:
     """
     Read a session or a request, with the options recorded in it; options given as flags override them.
 
@@ -88,11 +93,13 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
     path = chosen.session if path is None else path
     request = read_request(path) if is_request(path) else None
     session = read_session(path, chosen.namespace) if request is None else \
-        Session(path, (), (), dict(request.options), ())
-    recorded = session.recorded or {}
+        Session(path, (), (), dict(request.options), request.problems, request.refusal)
+    recorded, problems, refusal = session.recorded or {}, session.problems, session.refusal
     if of_result:
-        observed = names_of(OBSERVATION)
-        recorded = {**of_result, **{name: value for name, value in recorded.items() if name in observed}}
+        observed = {name: value for name, value in recorded.items() if name in names_of(OBSERVATION)}
+        if 'scene' not in observed:
+            refusal = refusal or of_result.refusal
+        recorded, problems = {**of_result.values, **observed}, (*of_result.problems, *problems)
     given = given_options(chosen)
     options = Options.of({**Options().flat(), **recorded, **given})
     for name in given:
@@ -101,9 +108,10 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
             note(f'{name}: {_text(value)} instead of {_text(recorded[name])}')
     trials, refusals = session_trials(session, options) if request is None else \
         request_trials(request, options)
-    for text in (*session.problems, *refusals):
-        note(text)
-    return Source(session, options, trials, refusals)
+    for text in (*problems, *refusals):
+        if text != str(refusal):
+            note(text)
+    return Source(session, options, trials, refusals, None if 'scene' in given else refusal)
 
 
 def _text(value: Any) -> str:

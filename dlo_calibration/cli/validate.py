@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     file = read_result(chosen.result)
-    source = read_source(chosen, tell, file.options).require_trials()
+    source = read_source(chosen, tell, file.file_options).require_trials()
     result = validated(file, source.trials, source.options, make_simulator)
     print_result(confirmed(result, source.options, make_simulator), chosen.json)
     return 0

@@ -15,7 +15,6 @@ from mcap.records import Channel, DataEnd, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from ruamel.yaml import YAML
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, OUR_RECORD, typestore
 
@@ -182,23 +181,11 @@ class Bag:
             except ValueError:
                 options = None
             if isinstance(options, dict):
-                self.options = self._usable_options(options)
+                self.options = options
             else:
                 self.problems.append('recorded options that cannot be read are left out')
         if 'mark' in entries:
             self.marks.append((entries['mark'], len(self.records)))
-
-    def _usable_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the options that this version knows and accepts."""
-        usable = {}
-        for name, value in options.items():
-            try:
-                Options.of({name: value})
-            except InputError as error:
-                self.problems.append(f'a recorded option is left out: {error}')
-            else:
-                usable[name] = value
-        return usable
 
     def _note_early_end(self, path: Path, before: int, error: Exception) -> None:
         """Note an early end of reading; raise an error where nothing was read."""

@@ -23,6 +23,7 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 
+from dlo_calibration.calibration.file_options import recordable
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.writing import replacing
 
@@ -112,8 +113,8 @@ class SessionWriter:
                 self._write_metadata_file()
 
     def write_options(self, options: Mapping[str, Any]) -> None:
-        """Record the current options, by name, so that a replay uses the same ones."""
-        self._write_metadata_record('options', json.dumps(dict(options), sort_keys=True))
+        """Record the current options, by name, but for those of the machine: a replay uses the same ones."""
+        self._write_metadata_record('options', json.dumps(recordable(options), sort_keys=True))
 
     def write_mark(self, mark: str) -> None:
         """

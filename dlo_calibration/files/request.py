@@ -132,11 +132,15 @@ class Request:
 
     :param options: the given options, by name, including the mass [kg] if it is known.
     :param name: name of the object.
+    :param problems: a text for each option in the file that is left out.
+    :param refusal: why the scene in the file is not among the options.
     """
 
     trials: tuple[TrialRequest, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
     name: str | None = None
+    problems: tuple[str, ...] = ()
+    refusal: InputError | None = None
 
     def __post_init__(self) -> None:
         if not self.trials:
@@ -183,19 +187,21 @@ def read_request(path: str | Path) -> Request:
     :raises InputError: where the file cannot be read, or is not a valid request;
         the text names the line and the element.
     """
-    return request_of(read_octets(path, WHAT, 'a calibration request'), f'{WHAT} {path}')
+    return request_of(read_octets(path, WHAT, 'a calibration request'), f'{WHAT} {path}', Path(path).parent)
 
 
-def request_of(octets: bytes, where: str = WHAT) -> Request:
+def request_of(octets: bytes, where: str = WHAT, folder: Path | None = None) -> Request:
     """
     Read a request from the bytes of its document.
 
     :param where: name of the document in errors.
+    :param folder: of the document, in which its scene may lie.
     :raises InputError: where it is not a valid request.
     """
     root = parse(octets, where, 'calibration_request')
     of_object, settings, *trials = root
-    options = read_options(where, settings)
+    given = read_options(where, settings, folder)
+    options = dict(given.values)
     if 'mass' in options:
         raise refused(where, settings, "an option 'mass'", 'the mass as an attribute of <object>', 'move it')
     if of_object.get('mass') is not None:
@@ -205,7 +211,8 @@ def request_of(octets: bytes, where: str = WHAT) -> Request:
         except InputError as error:
             raise refused(where, of_object, f'mass {error.came}', error.expected, error.remedy) from error
     try:
-        return Request(tuple(_trial(where, trial) for trial in trials), options, of_object.get('name'))
+        return Request(tuple(_trial(where, trial) for trial in trials), options, of_object.get('name'),
+                       given.problems, given.refusal)
     except InputError as error:
         raise _placed(where, settings, error) from error
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
+from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.errors import InputError
@@ -58,6 +59,8 @@ class Description:
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
     :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
+    :param problems: a text for each option in the file that is left out.
+    :param refusal: why the scene in the file is not among the options.
     """
 
     parameters: Mapping[str, ParameterEstimate]
@@ -79,6 +82,8 @@ class Description:
     options: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
+    problems: tuple[str, ...] = ()
+    refusal: InputError | None = None
 
     def __post_init__(self) -> None:
         for name in ('parameters', 'fixed', 'options'):
@@ -96,6 +101,11 @@ class Description:
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
             errors=result.errors, options=options or {}, warnings=result.warnings,
             confirmation=result.confirmation, **{key: told[key] for key in HOW})
+
+    @property
+    def file_options(self) -> FileOptions:
+        """The options, with what was left out of them."""
+        return FileOptions(self.options, self.problems, self.refusal)
 
     @property
     def values(self) -> dict[str, float]:
@@ -158,14 +168,16 @@ def read_result(path: str | Path) -> Description:
     :raises InputError: where the file cannot be read, or is not a valid result;
         the text names the line and the element.
     """
-    return read_description(read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}')
+    return read_description(read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}', Path(path).parent)
 
 
-def read_description(octets: bytes | str, where: str = 'dlo_description') -> Description:
+def read_description(octets: bytes | str, where: str = 'dlo_description',
+                     folder: Path | None = None) -> Description:
     """
     Read the definition of a DLO from its document, e.g. the text of the message `dlo_description`.
 
     :param where: name of the document in errors.
+    :param folder: of the document, in which its scene may lie.
     :raises InputError: where it is not a valid definition.
     """
     if isinstance(octets, str):
@@ -173,6 +185,7 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
     root = parse(octets, where, 'dlo')
     chain, parameters, calibration = root
     fit, *second, options, warnings = calibration
+    given = read_options(where, options, folder)
     seed = calibration.get('seed')
     try:
         dlo = Description(
@@ -185,7 +198,8 @@ def read_description(octets: bytes | str, where: str = 'dlo_description') -> Des
             search=calibration.get('search'), engine=calibration.get('engine'),
             seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
             simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
-            stop_reason=calibration.get('stop_reason'), options=read_options(where, options),
+            stop_reason=calibration.get('stop_reason'), options=given.values,
+            problems=given.problems, refusal=given.refusal,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=_confirmation(where, second[0]) if second else None)
         space = dlo.space

@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Iterable
 
+from dlo_calibration.calibration.file_options import file_options, FileOptions
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, told
 from dlo_calibration.files.bag import Bag, decode, encode, Record
@@ -41,8 +42,9 @@ class Session:
         the last calibration of the session used, or, where none was started, all since
         the last reset.
     :param records: all recorded messages, also outputs, in log order.
-    :param recorded: the last recorded options, by name; None: none were recorded.
+    :param recorded: the last recorded options, by name, as far as a file may set them; None: there were none.
     :param problems: one text for each defect that did not prevent reading.
+    :param refusal: why the recorded scene is not among the options.
     """
 
     path: Path
@@ -50,16 +52,21 @@ class Session:
     records: tuple[Record, ...]
     recorded: dict[str, Any] | None = None
     problems: tuple[str, ...] = ()
+    refusal: InputError | None = None
 
     @property
     def options(self) -> Options:
-        """The recorded options; the defaults where none were recorded."""
-        return Options.of(self.recorded or {})
+        """
+        The recorded options; the defaults where none were recorded.
+
+        :raises InputError: where the recorded scene cannot be used.
+        """
+        return FileOptions(self.recorded or {}, refusal=self.refusal).options()
 
     @cached_property
     def trials(self) -> tuple[Trial, ...]:
         """The complete trials with the recorded options; `session_trials` also returns the refusals."""
-        return session_trials(self, self.options)[0]
+        return session_trials(self, Options.of(self.recorded or {}))[0]
 
     def outputs(self, name: str) -> tuple[Any, ...]:
         """
@@ -137,7 +144,9 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
     if late:
         problems.append(f'{late} message(s) before the last reset or after the last start are left out, '
                         'as the live calibration did not use them')
-    return Session(path, tuple(messages), records, source.options, counted(map(told, problems)))
+    recorded = file_options(source.options or {}, path if path.is_dir() else path.parent)
+    return Session(path, tuple(messages), records, None if source.options is None else dict(recorded.values),
+                   counted(map(told, [*problems, *recorded.problems])), recorded.refusal)
 
 
 def _input_topics(path: Path, records: Iterable[Record], namespace: str | None,

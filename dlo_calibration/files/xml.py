@@ -24,6 +24,7 @@ from typing import Any, Iterator, Mapping
 from lxml import etree
 import numpy as np
 
+from dlo_calibration.calibration.file_options import file_options, FileOptions, recordable
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
@@ -177,15 +178,19 @@ def read_vectors(where: str, element: Any) -> Floats:
 
 
 def add_options(parent: Any, tag: str, flat: Mapping[str, Any]) -> None:
-    """Add options by name, in the order of their declarations."""
-    element = add(parent, tag)
+    """Add options by name, in the order of their declarations, without those of the machine."""
+    element, flat = add(parent, tag), recordable(flat)
     for declaration in declarations():
         if declaration.name in flat:
             add(element, 'option', name=declaration.name, value=flat[declaration.name])
 
 
-def read_options(where: str, element: Any) -> dict[str, Any]:
-    """Return options by name, each checked by its declaration."""
+def read_options(where: str, element: Any, folder: Path | None) -> FileOptions:
+    """
+    Return the options of a document, each checked by its declaration, as far as a file may set them.
+
+    :param folder: of the document; None: it is not a file.
+    """
     known = {declaration.name: declaration for declaration in declarations()}
     found: dict[str, Any] = {}
     for option in element:
@@ -198,7 +203,8 @@ def read_options(where: str, element: Any) -> dict[str, Any]:
         except InputError as error:
             raise refused(where, option, f'{error.thing}: {error.came}', error.expected,
                           error.remedy) from error
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+    return file_options({name: list(value) if isinstance(value, tuple) else value
+                         for name, value in found.items()}, folder)
 
 
 def _option(declaration: Declaration, text: str) -> Any:

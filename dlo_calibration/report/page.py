@@ -13,6 +13,7 @@ import platform
 import shlex
 from typing import Any, Iterable, Mapping, Sequence
 
+from dlo_calibration.calibration.file_options import recordable
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
@@ -52,7 +53,7 @@ class Origin:
 
 def repeating_command(session: str, options: Options) -> str:
     """Return the command that calibrates on a session with these options."""
-    changed = _changed(options)
+    changed = recordable(_changed(options))
     return shlex.join(['dlo-calibration', 'fit', session,
                        *(word for name, value in changed.items() for word in as_flags(name, value))])
 

@@ -19,6 +19,7 @@ import time
 
 from processes import children
 import pytest
+from serial import serial
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import Deadly, new_toy, ToySimulator
 
@@ -47,7 +48,7 @@ TYPES = bag_types()
 @pytest.fixture
 def session(tmp_path):
     """Give a session of two trials, recorded with options."""
-    return write_session(tmp_path / 'recorded', session_messages(TYPES, 2), {'evaluations': 20, 'workers': 1})
+    return write_session(tmp_path / 'recorded', session_messages(TYPES, 2), {'evaluations': 20})
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def run(capsys):
     """Give a function that returns exit code, stdout and stderr of a command with the toy."""
     def run(*words, toy=None):
         try:
-            code = cli.main([str(word) for word in words], lambda options: toy or ToySimulator())
+            code = cli.main(serial(words), lambda options: toy or ToySimulator())
         except SystemExit as end:  # argparse
             code = end.code
         output, errors = capsys.readouterr()
@@ -383,28 +384,29 @@ SCENE = ('<robot name="box"><link name="box"><collision><origin xyz="5 0 0"/><ge
 
 
 def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsys):
-    """The scene is recorded as it was given, found from the working directory, and named in the report."""
+    """The scene is found in the session's folder, from anywhere, and named in the report."""
     monkeypatch.chdir(tmp_path)
-    Path('my scene.urdf').write_text(SCENE, encoding='utf-8')
     session = write_session(tmp_path / 'recorded', session_messages(TYPES, 1),
                             {'scene': 'my scene.urdf', 'calibrate': ['flexibility'], 'evaluations': 2,
-                             'workers': 1, 'settle_limit': 0.2, 'nodes': 8, 'time_step': 0.01})
+                             'settle_limit': 0.2, 'nodes': 8, 'time_step': 0.01})
+    scene = session / 'my scene.urdf'
+    scene.write_text(SCENE, encoding='utf-8')
     documents = []
-    for source in (session, 'out/session.mcap'):
-        assert cli.main(['fit', str(source), '--json', '--output', 'out']) == 0
+    for source in ([str(session)], ['out/session.mcap', '--scene', str(scene)]):
+        assert cli.main(['fit', *source, '--workers', '1', '--json', '--output', 'out']) == 0
         documents.append(json.loads(capsys.readouterr().out))
     first, again = ({key: value for key, value in one.items() if key != 'seconds'} for one in documents)
     assert first == again
     assert (first['engine'], first['confirmation']) == ('bullet', None)
-    assert read_result('out/result.xml').options['scene'] == 'my scene.urdf'
-    assert "--scene 'my scene.urdf'" in html.unescape(Path('out/report.html').read_text(encoding='utf-8'))
+    assert read_result('out/result.xml').refusal is not None  # it is not in the folder of this file
+    assert f"--scene '{scene}'" in html.unescape(Path('out/report.html').read_text(encoding='utf-8'))
     assert cli.main(['validate', 'out/result.xml', str(session), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['score'] == first['score']
-    Path('my scene.urdf').unlink()
+    scene.unlink()
     assert cli.main(['fit', str(session)]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith('dlo-calibration: scene my scene.urdf: got ')
-    assert 'relative to the working directory' in error
+    assert error.startswith('dlo-calibration: recorded scene my scene.urdf: got no such file ')
+    assert 'give it with --scene' in error
 
 
 def test_compiled_engine_and_scene_end_with_one_line(session, capsys):

@@ -31,8 +31,7 @@ def demo(environment, *arguments):
 
 def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path):
     sample = write_session(tmp_path / 'sample', session_messages(bag_types(), 1), {
-        'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,
-        'workers': 1})
+        'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2})
     process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '4',
                    '--sample', str(sample))
     output, errors = process.communicate(timeout=PATIENCE)

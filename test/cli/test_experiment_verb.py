@@ -34,7 +34,7 @@ FILES = {'calibrations.jsonl', 'calibrations.csv', 'consistency.csv', 'validity.
 def session(tmp_path):
     """Give a session of three trials, whose recorded search an experiment does not take."""
     return write_session(tmp_path / 'rope', session_messages(bag_types(), 3),
-                         {'evaluations': 3, 'workers': 1, 'seed': 9, 'mass': 0.1})
+                         {'evaluations': 3, 'seed': 9, 'mass': 0.1})
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from serial import serial
 from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
 
@@ -291,7 +292,7 @@ def test_path_without_file_and_place_that_cannot_be_written_are_refused(tmp_path
 def command(capsys):
     """Give a function that returns exit code, stdout and stderr of a command with the toy."""
     def act(*words):
-        code = cli.main([str(word) for word in words], lambda options: ToySimulator())
+        code = cli.main(serial(words), lambda options: ToySimulator())
         return code, *capsys.readouterr()
 
     return act
@@ -302,7 +303,7 @@ def file(tmp_path):
     """Give the path of a request with the toy's trials."""
     path = tmp_path / 'asked.xml'
     write_request(path, Request(tuple(TrialRequest.of(trial) for trial in toy_trials(2)),
-                                {'evaluations': 20, 'workers': 1, 'mass': 0.2}))
+                                {'evaluations': 20, 'mass': 0.2}))
     return path
 
 
@@ -336,7 +337,7 @@ def test_info_says_what_is_in_a_request(command, file):
     code, output, _ = command('info', file, '--json')
     found = json.loads(output)
     assert (code, [trial['name'] for trial in found['trials']]) == (0, ['trial 1', 'trial 2'])
-    assert found['options'] == {'evaluations': 20, 'workers': 1, 'mass': 0.2}
+    assert found['options'] == {'evaluations': 20, 'mass': 0.2}
     assert command('info', file)[0] == 0
 
 

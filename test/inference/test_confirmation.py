@@ -8,6 +8,7 @@ import json
 from fitting import fitted
 import numpy as np
 import pytest
+from serial import serial
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import ToySimulator
 
@@ -177,12 +178,12 @@ def test_a_confirmation_that_takes_too_long_after_a_stop_is_given_up(monkeypatch
 def command(capsys, tmp_path):
     """Give a function that does what a command line says on a session, and returns its JSON document."""
     session = write_session(tmp_path / 'recorded', session_messages(bag_types(), 2),
-                            {'evaluations': 20, 'workers': 1})
+                            {'evaluations': 20})
 
     def act(verb, *words):
         capsys.readouterr()
         before = (tmp_path / 'out/result.xml',) if verb == 'validate' else ()
-        assert cli.main([str(word) for word in (verb, *before, session, '--json', *words)],
+        assert cli.main(serial((verb, *before, session, '--json', *words)),
                         engines(SecondToy(0.004))) == 0
         return json.loads(capsys.readouterr().out)
     return act

@@ -202,7 +202,7 @@ def test_of_many_trials_the_worst_are_drawn(page):
 def test_command_and_options_that_repeat_it(result, page, tmp_path):
     (tmp_path / 'session.mcap').write_bytes(b'what was heard')
     command = repeating_command('session.mcap', OPTIONS)
-    assert command == 'dlo-calibration fit session.mcap --mass 0.03 --evaluations 60 --seed 4 --workers 1'
+    assert command == 'dlo-calibration fit session.mcap --mass 0.03 --evaluations 60 --seed 4'
     text = page(result, Origin('s', command, OPTIONS, digests([tmp_path / 'session.mcap'])))
     assert command in unescape(text)
     assert hashlib.sha256(b'what was heard').hexdigest() in text
