@@ -20,6 +20,7 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from result_message import result_values
+from serial import serial
 from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
@@ -59,7 +60,7 @@ def folders(path):
 
 def fitted(session, capsys, *flags):
     """Return the JSON of `fit` with the toy."""
-    assert cli.main(['fit', str(session), '--json', *flags], lambda _: ToySimulator()) == 0
+    assert cli.main(serial(['fit', session, '--json', *flags]), lambda _: ToySimulator()) == 0
     return json.loads(capsys.readouterr().out)
 
 

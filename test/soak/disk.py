@@ -34,7 +34,7 @@ SHORT, FULL = 1, 45
 PATIENCE = 90.0  # s for a process
 SIZES = 4, 600  # kB; the largest has room for all files of most commands
 SMALL = {'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,
-         'evaluations': 6, 'workers': 1}
+         'evaluations': 6}
 #: A disk of $1 kB at $2, for the command in the other words; its files are in $3 afterwards.
 DISK = """trap : INT; size=$1 disk=$2 kept=$3; shift 3
 mount -t tmpfs -o size=${size}k tmpfs "$disk" || exit 99
@@ -84,13 +84,13 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
 
 def on_fit(disk: Disk, session: Path) -> tuple[list[str], list[str], bool]:
     """Let `fit` write to a disk; return what was lost, what died, and whether it began at all."""
-    return _on_verb(disk, FIT, 'fit', session, '--json', '--output', disk.path / 'out')
+    return _on_verb(disk, FIT, 'fit', session, '--workers', 1, '--json', '--output', disk.path / 'out')
 
 
 def on_experiment(disk: Disk, session: Path) -> tuple[list[str], list[str], bool]:
     """Let `experiment` write to a disk, as `on_fit` does."""
     return _on_verb(disk, EXPERIMENT, 'experiment', session, '--runs', 1, '--search', 'random',
-                    '--held-back', 1, '--json', '--output', disk.path / 'out')
+                    '--held-back', 1, '--workers', 1, '--json', '--output', disk.path / 'out')
 
 
 def _on_verb(disk: Disk, names: tuple[str, ...], *words: object) -> tuple[list[str], list[str], bool]:

@@ -37,11 +37,11 @@ SHORT, FULL = 2, 110
 PATIENCE = 60.0  # s from the signal to the end of the process
 ORPHANED = 5.0  # s that a child process may outlive its parent
 SMALL = {'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,
-         'evaluations': 30, 'workers': 2}
+         'evaluations': 30}
 DEMO = ('-m', 'dlo_calibration.cli.demo', '--sample', '{session}', '--output', '{out}', '--evaluations', '20')
 #: Each with the time that it takes to its end [s], on a machine that does other work, too.
 COMMANDS = (
-    (4.0, ('-m', 'dlo_calibration', 'fit', '{session}', '--json', '--output', '{out}')),
+    (4.0, ('-m', 'dlo_calibration', 'fit', '{session}', '--workers', '2', '--json', '--output', '{out}')),
     (0.9, ('-m', 'dlo_calibration', 'info', '{session}', '--json')),
     (3.0, ('-m', 'dlo_calibration.ros.calibrator', '--ros-args', '-p', 'output_directory:="{out}"')),
     (4.0, ('-m', 'dlo_calibration', 'plot', '{session}', '{result}', '--json', '--animation',

@@ -7,4 +7,4 @@
 def serial(words):
     """Return the words of a command line, with one worker for `fit` unless they name a number."""
     words = [str(word) for word in words]
-    return words if words[0] != 'fit' or '--workers' in words else [*words, '--workers', '1']
+    return words if words[:1] != ['fit'] or '--workers' in words else [*words, '--workers', '1']
