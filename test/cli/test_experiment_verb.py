@@ -8,6 +8,7 @@ import errno
 import functools
 import json
 import os
+from pathlib import Path
 import re
 import signal
 import subprocess
@@ -216,7 +217,8 @@ def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, work
 
 def test_what_cannot_be_written_is_named_and_the_tables_are_told(run, session, tmp_path, undrawn,
                                                                  monkeypatch):
-    out, replace, fsync = tmp_path / 'out', os.replace, os.fsync
+    monkeypatch.chdir(tmp_path)  # a long path would shorten the sentence
+    out, replace, fsync = Path('out'), os.replace, os.fsync
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
