@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 import time
-from typing import Any, Callable, Protocol
+from typing import Any, Callable
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import LiveInformation
@@ -31,46 +31,13 @@ from dlo_calibration.messages.refusals import Refusals
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
+from dlo_calibration.ros.graph import Graph
 from dlo_calibration.ros.markers import markers
 from dlo_calibration.ros.recorder import Recorder
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
 DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
-
-
-class Graph(Protocol):
-    """What a session needs from its node."""
-
-    def options(self) -> Options:
-        """Return the options in force."""
-
-    def stamp(self) -> int:
-        """Return the time for the header of a message [ns]."""
-
-    def topic(self, name: str) -> str:
-        """Return the full name of one of the node's topics."""
-
-    def decode(self, kind: str, octets: bytes) -> Any:
-        """Return the message that came on an input topic; damaged bytes may raise any exception."""
-
-    def encode(self, name: str, message: Any) -> bytes:
-        """Return the CDR bytes of a message for an output topic."""
-
-    def publish(self, name: str, octets: bytes) -> None:
-        """Publish bytes on an output topic."""
-
-    def hear_waiting(self) -> None:
-        """Pass the messages in the queues of the input topics to the session."""
-
-    def info(self, text: str) -> None:
-        """Log a text."""
-
-    def warn(self, text: str) -> None:
-        """Log a warning."""
-
-    def error(self, text: str) -> None:
-        """Log an error."""
 
 
 @dataclass
