@@ -16,6 +16,7 @@ from functools import lru_cache
 from io import StringIO
 import json
 from pathlib import Path
+import time
 from typing import Any, BinaryIO, cast, Mapping
 
 from mcap.writer import CompressionType, Writer
@@ -60,6 +61,7 @@ class SessionWriter:
 
     def __init__(self, path: str | Path, options: Mapping[str, Any] | None = None) -> None:
         self._failure = ''
+        self._epoch = time.time_ns() - time.monotonic_ns()
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[tuple[str, str], int] = {}
@@ -88,18 +90,21 @@ class SessionWriter:
         """Whether nothing can be written any more."""
         return bool(self._failure)
 
-    def write(self, topic: str, message_type: str, data: bytes, log_time: int, flush: bool = True) -> None:
+    def write(self, topic: str, message_type: str, data: bytes, log_time: int | None = None,
+              flush: bool = True) -> None:
         """
         Record one message.
 
         :param topic: its full name, e.g. ``/calibrator/action``.
         :param message_type: ``package/msg/Type``, one of Jazzy's common_interfaces.
         :param data: CDR bytes.
-        :param log_time: [ns], greater than 0.
+        :param log_time: [ns], greater than 0; None: now, by a clock that never goes back.
         :param flush: False where more messages follow at once; such a group takes less
             space, and is written with its last message.
         """
         key = topic, message_type
+        if log_time is None:
+            log_time = self._epoch + time.monotonic_ns()
         with self._disk():
             new = key not in self._channels
             if new:
@@ -124,6 +129,15 @@ class SessionWriter:
             messages a result uses.
         """
         self._write_metadata_record('mark', mark)
+
+    def write_dropped(self, counts: Mapping[str, int]) -> None:
+        """Record how many messages of each kind were dropped since the session began."""
+        self._write_metadata_record('dropped', json.dumps(dict(counts), sort_keys=True))
+
+    def flush(self) -> None:
+        """Give the messages that wait in a group to the operating system."""
+        with self._disk():
+            self._writer.flush()
 
     def close(self) -> None:
         """Write the index and the final metadata.yaml; closing twice does nothing."""

@@ -10,10 +10,12 @@ other bags that contain the topics of the calibrator.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Iterable
+
+import numpy as np
 
 from dlo_calibration.calibration.file_options import file_options, FileOptions
 from dlo_calibration.calibration.options import Options
@@ -30,6 +32,9 @@ from dlo_calibration.messages.codec import (
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.messages.refusals import counted
+from dlo_calibration.messages.stamp_order import StampOrder, went_back
+from dlo_calibration.messages.trial_builder import Key, Message
+from dlo_calibration.messages.trial_builder import order as order_of
 from dlo_calibration.model.trial import Trial
 
 
@@ -90,21 +95,57 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
 
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
     """Return the complete trials of a session, and the reasons why messages are not used, each once."""
-    collector = TrialCollector(options)
-    usable, refusals = [], []
+    order, refusals = StampOrder(), []
+    clocks: list[list[Message]] = [[]]  # the messages before and after each jump of the clock
     for kind, message in session.messages:
         try:
-            usable.append(read(kind, message))
+            one = read(kind, message)
+            order.check(one)
         except InputError as error:
             refusals.append(str(error))
-    for one in sorted(usable, key=lambda one: one.stamp):  # the trials do not depend on the order of arrival
+            continue
+        if order.clock_went_back(one):
+            refusals.append(f'{went_back(order.newest, one.stamp)}: '
+                            'what comes after it makes trials of its own')
+            order = order.after_jump()
+            clocks.append([])
+        order.add(one)
+        clocks[-1].append(one)
+    trials: list[Trial] = []
+    known: dict[Key, Message] = {}
+    for messages in clocks:
+        fresh = [one for one in messages if order_of(one) not in known or not _same(one, known[order_of(one)])]
+        if len(fresh) < len(messages):
+            refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat earlier '
+                            'ones: a recording that was played again is no second observation')
+        known |= {order_of(one): one for one in messages}
+        found, problems = _collected(fresh, options)
+        trials += found
+        refusals += problems
+    named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
+    return tuple(named), counted(refusals)
+
+
+def _collected(messages: Iterable[Message], options: Options) -> tuple[tuple[Trial, ...], list[str]]:
+    """Return the trials in messages with stamps of one clock, and why messages are not used."""
+    collector = TrialCollector(options)
+    refusals = []
+    # The trials do not depend on the order of arrival.
+    for one in sorted(messages, key=lambda one: one.stamp):
         try:
             collector.add(one)
         except InputError as error:
             refusals.append(str(error))
         refusals += [str(refusal) for refusal in collector.take_news()]
     refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
-    return collector.trials, counted(refusals)
+    return collector.trials, refusals
+
+
+def _same(one: Message, other: Message) -> bool:
+    """Tell whether two messages of one kind and stamp have the same content."""
+    a, b = (message.positions if isinstance(message, ActionMessage) else message.chain.points
+            for message in (one, other))
+    return bool(np.array_equal(a, b, equal_nan=True))
 
 
 def read_session(path: str | Path, namespace: str | None = None) -> Session:

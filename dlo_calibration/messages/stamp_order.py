@@ -12,7 +12,9 @@ back, and none goes back behind the beginning of the newest trial.
 from __future__ import annotations
 
 from heapq import nlargest
+import math
 
+from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS
 from dlo_calibration.messages.trial_builder import Message
 
@@ -24,45 +26,71 @@ class StampOrder:
     """
     The newest stamps of messages, in the order in which they came.
 
-    The clock went back if a message is stamped
+    A message goes back if it is stamped
 
     - more than MARGIN before the newest one of its own topic,
     - before the newest initial chain, and
     - before two other messages, as a single wrong stamp in the future is no clock.
 
-    Messages of the former clock that are still under way then are `late`: they are stamped
-    near its end, on a topic that has not yet gone back.
+    An initial chain that goes back tells that the clock did.  An action or a goal chain that does may
+    belong to either clock, so it is refused.  So are messages that were still under way as the clock went
+    back: they are stamped near the end of the former clock, on a topic that has not yet gone back.
+
+    :param former: the newest stamp before the clock went back [ns]; 0: it never did.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, former: int = 0) -> None:
+        self._frame = ''
         self._newest: dict[str, int] = {}  # of each topic
         self._latest: list[int] = [0]  # the two newest of all topics
-        self._former = 0  # newest stamp before the clock went back
-        self._waiting: set[str] = set()  # topics that have not yet gone back
+        self._first: float = math.inf  # of the initial chains
+        self._former = former
+        self._waiting = set(INPUT_TYPES) if former else set()  # topics that have not yet gone back
 
     @property
     def newest(self) -> int:
         """The newest stamp [ns]; 0 before the first message."""
         return self._latest[0]
 
-    def goes_back(self, message: Message) -> bool:
+    def clock_went_back(self, message: Message) -> bool:
         """Tell whether the clock went back before this message."""
+        return message.kind == INITIAL and message.frame_id == self._frame and self._goes_back(message)
+
+    def check(self, message: Message) -> None:
+        """
+        Check that a message certainly belongs to the trials of the present clock.
+
+        :raises InputError: if it does not.
+        """
+        if message.frame_id != self._frame:
+            return  # the collector refuses it
+        remedy = 'stamp all messages with one clock, and send an initial_chain first after it went back'
+        if message.kind in self._waiting and abs(message.stamp - self._former) <= MARGIN \
+                and message.stamp > self.newest + MARGIN:
+            raise InputError(str(message), 'a stamp from before the clock went back',
+                             'one of the present clock', remedy)
+        # What is stamped before all trials can be used by none; the collector refuses it.
+        if message.kind != INITIAL and message.stamp > self._first and self._goes_back(message):
+            earlier = (self._newest[message.kind] - message.stamp) / NANOSECONDS
+            raise InputError(
+                str(message), f'it {earlier:.6g} s before the newest {message.kind}, in an earlier trial',
+                'the order of stamps on each topic', remedy)
+
+    def _goes_back(self, message: Message) -> bool:
         return (message.stamp < self._newest.get(message.kind, 0) - MARGIN
                 and message.stamp < self._newest.get(INITIAL, 0) and message.stamp < self._latest[-1])
 
-    def late(self, message: Message) -> bool:
-        """Tell whether this message was stamped before the clock went back."""
-        return (message.kind in self._waiting and abs(message.stamp - self._former) <= MARGIN
-                and message.stamp > self.newest + MARGIN)
-
-    def restart(self) -> None:
-        """Begin anew, as the clock went back."""
-        former = self.newest
-        self.__init__()  # type: ignore[misc]
-        self._former, self._waiting = former, set(INPUT_TYPES)
+    def after_jump(self) -> StampOrder:
+        """Return the order of the messages from now on, as the clock went back."""
+        return StampOrder(self.newest)
 
     def add(self, message: Message) -> None:
-        """Take a message that is not `late`."""
+        """Take a message that `check` does not refuse; ignore one in another frame than the first."""
+        self._frame = self._frame or message.frame_id
+        if message.frame_id != self._frame:
+            return
+        if message.kind == INITIAL:
+            self._first = min(self._first, message.stamp)
         if message.stamp < self._former - MARGIN:
             self._waiting.discard(message.kind)
         self._newest[message.kind] = max(self._newest.get(message.kind, 0), message.stamp)

@@ -15,7 +15,8 @@ import sys
 from typing import Any, Callable, Sequence
 
 import rclpy
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -30,6 +31,7 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.errors import InputError, printable
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
+from dlo_calibration.messages.stamp_order import MARGIN
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.parameters import OptionsNode
 from dlo_calibration.ros.session import CalibrationSession, DEFECT
@@ -115,6 +117,9 @@ class CalibratorNode(OptionsNode):
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         # A steady clock: with use_sim_time and no /clock, a timer on the node's own clock would never fire.
         self.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-MARGIN)),
+            post_callback=self._on_jump)
         self.info('collecting trials; call ~/start to calibrate')
 
     def close(self) -> None:
@@ -172,7 +177,7 @@ class CalibratorNode(OptionsNode):
             while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
                 self.session.hear(kind, taken[0])
 
-    # Services and the timer
+    # Services, the timer and the clock
 
     def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = self.session.request(name)
@@ -184,6 +189,11 @@ class CalibratorNode(OptionsNode):
             self.session.tick()
         except Exception as error:  # a callback that raises would end the node
             self.session.fail(f'{error!r}; {DEFECT}')
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        if jump.clock_change == ClockChange.ROS_TIME_NO_CHANGE:
+            now = self.stamp()
+            self.session.clock_went_back(now - jump.delta.nanoseconds, now)
 
     # The graph of the session
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import time
-from typing import Callable
+from typing import Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
@@ -36,6 +36,7 @@ class Recorder:
         self._reporter = ReportWriter(make_simulator)
         self._session: SessionWriter | None = None
         self._missing: dict[Path, list[str]] = {}  # by the folder of a session that has not ended
+        self._calibrated: SessionWriter | None = None  # the session of the calibration under way
 
     @property
     def folder(self) -> Path | None:
@@ -51,23 +52,46 @@ class Recorder:
             except RecordingError as error:
                 self._miss(path, f'everything: {_cause(error)}', str(error))
 
-    def message(self, topic: str, kind: str, octets: bytes) -> None:
-        """Record a message that was received or sent just now: CDR `octets` of the type `kind`."""
-        self._write(lambda session: session.write(topic, kind, octets, time.time_ns()))
+    def message(self, topic: str, kind: str, octets: bytes, flush: bool = True) -> None:
+        """
+        Record a message that was received or sent just now: CDR `octets` of the type `kind`.
+
+        :param flush: False where `flush` follows soon.
+        """
+        self._write(lambda session: session.write(topic, kind, octets, flush=flush))
+
+    def of_calibration(self, topic: str, kind: str, octets: bytes) -> None:
+        """Record a message of the calibration under way in the session in which it started."""
+        self._write(lambda session: session.write(topic, kind, octets), self._calibrated)
+
+    def flush(self) -> None:
+        """Give the messages that wait in a group to the operating system."""
+        self._write(SessionWriter.flush)
+
+    def dropped(self, counts: Mapping[str, int]) -> None:
+        """Record how many messages of each kind were dropped since the session began."""
+        self._write(lambda session: session.write_dropped(counts))
 
     def start(self, options: Options) -> None:
         """Record that a calibration with `options` starts, on the messages recorded so far."""
         self._write(lambda session: session.write_options(options.flat()))
         self._write(lambda session: session.write_mark('start'))
+        self._calibrated = self._session
+
+    def finish(self) -> None:
+        """End the calibration; its session ends too, if another one has begun."""
+        calibrated, self._calibrated = self._calibrated, None
+        if calibrated is not self._session:
+            self._write(SessionWriter.close, calibrated)
 
     def result(self, result: CalibrationResult, options: Options) -> None:
         """
-        Write result.xml and evaluations.csv (result_2.xml, ...) into the session's folder.
+        Write result.xml and evaluations.csv (result_2.xml, ...) into the folder of the calibration's session.
 
         report.html (report_2.html, ...) follows some seconds later.
         """
-        if self._session is not None:
-            folder = self._session.path
+        if self._calibrated is not None:
+            folder = self._calibrated.path
             suffix, attempts = _free(folder), Attempts(folder)
             name = f'result{suffix}.xml'
             with attempts.attempt(name):
@@ -86,13 +110,19 @@ class Recorder:
             self._miss(path.parent, f'{path.name}: {why}')
 
     def end(self) -> None:
-        """End the session, and tell what its folder lacks; without one, do nothing."""
-        self._write(SessionWriter.close)
+        """
+        End the session, and tell what its folder lacks; without one, do nothing.
+
+        While a calibration is under way, its session stays open until that ends.
+        """
+        if self._session is not self._calibrated:
+            self._write(SessionWriter.close)
         self._session = None
         self._conclude()
 
     def close(self) -> None:
         """End the session, wait for its report, and tell what its folder lacks."""
+        self.finish()
         self._write(SessionWriter.close)
         self._reporter.close()
         self.end()
@@ -109,8 +139,9 @@ class Recorder:
         self._on_failure((text or f'session {folder}: could not be written: {what}')
                          + '; once there is room, ~/reset begins a new session')
 
-    def _write(self, write: Callable[[SessionWriter], None]) -> None:
-        session = self._session
+    def _write(self, write: Callable[[SessionWriter], None], to: SessionWriter | None = None) -> None:
+        """Write to a session, by default the one that is being recorded."""
+        session = self._session if to is None else to
         if session is None or session.failed:
             return
         try:

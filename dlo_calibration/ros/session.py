@@ -10,89 +10,33 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, field
 import time
 from typing import Any, Callable
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import LiveInformation
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.result import description_document
-from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
-from dlo_calibration.messages.collector import KEPT, TrialCollector
-from dlo_calibration.messages.refusals import Refusals
+from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.messages.stamp_order import StampOrder, went_back
+from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.graph import Graph
 from dlo_calibration.ros.markers import markers
+from dlo_calibration.ros.memory import Calibration, Memory, Pace
 from dlo_calibration.ros.recorder import Recorder
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
+OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
 DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
-
-
-@dataclass
-class _Calibration:
-    """
-    A calibration under way.
-
-    :param sent: time of its last progress message [s].
-    """
-
-    options: Options
-    progress: Progress
-    sent: float = float('-inf')
-
-
-@dataclass
-class _Pace:
-    """
-    When to repeat something that is repeated if needed, but not too often.
-
-    :param wanted: whether it is needed.
-    :param last: time when it was done last [s].
-    """
-
-    wanted: bool = False
-    last: float = float('-inf')
-
-
-@dataclass
-class _Memory:
-    """
-    What a reset forgets, besides the trials.
-
-    :param detail: about the state, e.g. why the calibration failed.
-    :param refusals: the latest ones, which are not reported again.
-    :param counted: the same, by their reason.
-    :param heard: time of the last action or goal chain [s].
-    :param started: whether a calibration was started, so that `start_after_trials` starts none.
-    :param status: content of the last ``~/status``.
-    :param result: of the last calibration.
-    :param information: about the newest trial that was appraised.
-    """
-
-    state: str = 'collecting'
-    detail: str = ''
-    last_refusal: str = ''
-    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
-    counted: Refusals = field(default_factory=Refusals)
-    heard: float = float('-inf')
-    started: bool = False
-    status: dict[str, Any] = field(default_factory=dict)
-    result: CalibrationResult | None = None
-    information: TrialInformation | None = None
-    markers: _Pace = field(default_factory=_Pace)
-    appraisal: _Pace = field(default_factory=_Pace)
 
 
 class CalibrationSession:
@@ -115,8 +59,10 @@ class CalibrationSession:
         self._worker = Worker(make_simulator)
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
-        self._memory = _Memory()
-        self._calibration: _Calibration | None = None
+        self._memory = Memory()
+        self._calibration: Calibration | None = None
+        self._order = StampOrder()
+        self._began = self._clock()
         self._begin_recording()
         self._report()
 
@@ -125,29 +71,28 @@ class CalibrationSession:
         """Tell whether a calibration is under way."""
         return self._calibration is not None
 
-    def hear(self, kind: str, octets: bytes) -> None:
-        """Record a message that came on an input topic, then collect it or refuse it."""
-        memory = self._memory
-        self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets)
+    def hear(self, kind: str, octets: bytes, flush: bool = True) -> None:
+        """
+        Record a message that came on an input topic, then collect it or refuse it.
+
+        :param flush: False where `flush` follows soon.
+        """
+        message, problem = self._read(kind, octets)
+        if message is not None and self._order.clock_went_back(message):
+            self._begin_anew(went_back(self._order.newest, message.stamp))
+        self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
         if kind != INITIAL:
-            memory.heard = self._clock()
-            memory.markers.wanted = memory.appraisal.wanted = True
-        try:
-            try:
-                message = self._graph.decode(kind, octets)
-            except Exception as error:  # whatever the decoder meets in damaged bytes
-                raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
-                                 'check what publishes it') from error
-            self._collector.add(read(kind, message))
-            for refusal in self._collector.take_news():
-                self.refuse(str(refusal))
-        except InputError as error:
-            self.refuse(str(error))
-        except Exception as error:  # a defect of this package must not end the session
-            self.refuse(f'{kind}: could not be used ({error!r}); {DEFECT}')
-        else:
-            if not self.calibrating:
-                memory.state, memory.detail = 'collecting', ''
+            self._memory.heard = self._clock()
+            self._memory.markers.wanted = self._memory.appraisal.wanted = True
+        problem = problem if message is None else self._collect(message)
+        if problem:
+            self.refuse(problem)
+        elif not self.calibrating:
+            self._memory.state, self._memory.detail = 'collecting', ''
+
+    def flush(self) -> None:
+        """Give the recorded messages to the operating system."""
+        self._recorder.flush()
 
     def refuse(self, text: str) -> None:
         """Tell why something was refused, in the log and in ``~/status``; a repeated reason not each time."""
@@ -200,6 +145,50 @@ class CalibrationSession:
         finally:
             self._recorder.close()
 
+    # Messages of the robot
+
+    def _read(self, kind: str, octets: bytes) -> tuple[Message | None, str]:
+        """Return a message, or None and why it cannot be read."""
+        try:
+            try:
+                message = self._graph.decode(kind, octets)
+            except Exception as error:  # whatever the decoder meets in damaged bytes
+                raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
+                                 'check what publishes it') from error
+            return read(kind, message), ''
+        except Exception as error:  # a defect of this package must not end the session
+            return None, _why(error, kind)
+
+    def _collect(self, message: Message) -> str:
+        """Collect a message; return why it is refused, if it is."""
+        try:
+            self._order.check(message)
+            self._order.add(message)
+            self._collector.add(message)
+            for refusal in self._collector.take_news():
+                self.refuse(str(refusal))
+        except Exception as error:
+            return _why(error, message.kind)
+        return ''
+
+    def clock_went_back(self, before: int, now: int) -> None:
+        """Begin another session, as the node's clock went from one time [ns] back to another."""
+        if self._clock() - self._began > 1.0:  # else the stamps of messages told it first
+            self._graph.hear_waiting()
+            self._begin_anew(went_back(before, now))
+
+    def _begin_anew(self, why: str) -> None:
+        """Begin another session because the clock went back."""
+        self._order = self._order.after_jump()
+        if self._memory.heard == float('-inf'):  # only initial chains came: there is no session to keep
+            self._collector.clear()
+            self._graph.warn(why)
+            return
+        count, folder = self._collector.count, self._recorder.folder
+        place = 'forgotten' if folder is None else f'in {folder}'
+        self._forget()
+        self.refuse(f'{why}: a new session begins; the {count} trial(s) of the former one are {place}')
+
     # Requests
 
     def _require_idle(self, service: str) -> None:
@@ -222,7 +211,7 @@ class CalibrationSession:
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
         self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         self._recorder.start(options)
-        self._calibration = _Calibration(options, Progress(options.evaluations, len(trials)))
+        self._calibration = Calibration(options, Progress(options.evaluations, len(trials)), self._memory)
         memory = self._memory
         memory.started, memory.state, memory.detail = True, 'calibrating', ''
         self._appraiser.stop()
@@ -251,15 +240,21 @@ class CalibrationSession:
 
     def _reset(self) -> str:
         self._require_idle('~/reset')
+        self._order = StampOrder()
+        self._forget()
+        return 'the trials are forgotten'
+
+    def _forget(self) -> None:
+        """Begin another session; a calibration under way goes on."""
         self._recorder.end()
         self._appraiser.stop()
         self._collected_with = self._graph.options()
         self._collector = TrialCollector(self._collected_with)
         self._tell_refusals(self._memory.counted.rest())
-        self._memory = _Memory()
+        self._memory = Memory(state='calibrating' if self.calibrating else 'collecting')
+        self._began = self._clock()
         self._begin_recording()
         self._show()
-        return 'the trials are forgotten'
 
     # Events of the worker, and appraisals of trials
 
@@ -282,10 +277,15 @@ class CalibrationSession:
         self._send_progress(calibration)
         self._worker.join()
         if isinstance(event, Failure):
+            self._recorder.finish()
             self.fail(event.text, f'calibration failed: {event.text}', *filter(None, [event.details]))
             return
         memory, options = self._memory, calibration.options
-        memory.state, memory.detail, memory.result = 'done', event.stop_reason, event
+        memory.state, memory.detail = 'done', event.stop_reason
+        if memory is calibration.memory:
+            memory.result = event
+        else:
+            memory.detail += '; this is the result of the session before the clock went back'
         found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
                           f'{measured(one.physical_value, one.physical_unit)}'
                           for name, one in event.parameters.items())
@@ -297,6 +297,7 @@ class CalibrationSession:
         self._send('dlo_description', self._types.build(
             OUTPUT_TYPES['dlo_description'], data=description_document(event, options.flat()).decode()))
         self._recorder.result(event, options)
+        self._recorder.finish()
         self._show()
         self._report()
 
@@ -309,12 +310,12 @@ class CalibrationSession:
         # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
         if memory.appraisal.wanted and not self.calibrating and self._collector.count \
                 and not self._appraiser.alive and (quiet or now - memory.appraisal.last > 2.0):
-            memory.appraisal = _Pace(wanted=not quiet, last=now)
+            memory.appraisal = Pace(wanted=not quiet, last=now)
             self._appraiser.start(self._collector.trials, self._graph.options(), memory.result, whole=quiet)
 
     # Messages of the node
 
-    def _send_progress(self, calibration: _Calibration) -> None:
+    def _send_progress(self, calibration: Calibration) -> None:
         """Send the newest evaluation, unless it has been sent."""
         progress = calibration.progress
         if progress.newest is None or progress.best is None:
@@ -338,14 +339,15 @@ class CalibrationSession:
 
     def _show(self) -> None:
         """Send the markers of all trials."""
-        self._memory.markers = _Pace(last=self._clock())
+        self._memory.markers = Pace(last=self._clock())
         self._send('markers', markers(self._types, self._collector.trials, stamp=self._graph.stamp(),
                                       frame_id=self._collector.frame_id, result=self._memory.result))
 
     def _send(self, name: str, message: Any) -> None:
         octets = self._graph.encode(name, message)
         # Recorded first, so that every message that a subscriber received is on the disk.
-        self._recorder.message(self._graph.topic(name), OUTPUT_TYPES[name], octets)
+        record = self._recorder.of_calibration if name in OF_CALIBRATION else self._recorder.message
+        record(self._graph.topic(name), OUTPUT_TYPES[name], octets)
         self._graph.publish(name, octets)
 
     def _begin_recording(self) -> None:
@@ -363,3 +365,8 @@ class CalibrationSession:
         self._memory.last_refusal = text
         self._graph.error(text)
         self._report()
+
+
+def _why(error: Exception, kind: str) -> str:
+    """Return why a message of a kind is refused."""
+    return str(error) if isinstance(error, InputError) else f'{kind}: could not be used ({error!r}); {DEFECT}'

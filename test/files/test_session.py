@@ -579,3 +579,32 @@ def test_sample_sessions_are_usable(number):
     assert [len(trial.hands) for trial in trials] == [1, 1, 1, 2]
     assert [goal.held_by for trial in trials for goal in trial.goals] == [
         (), (), ('left_hand',), ('left_hand', 'right_hand')]
+
+
+def shifted(messages, seconds, log_time):
+    """Return messages of a clock that went back, recorded later."""
+    found = []
+    for kind, message, _ in messages:
+        message = STORE.deserialize_cdr(encode(message, INPUT_TYPES[kind]), INPUT_TYPES[kind])
+        message.header.stamp.sec -= seconds
+        found.append((kind, message, log_time))
+    return found
+
+
+def test_trials_before_and_after_the_clock_went_back_never_mix(tmp_path):
+    later = MESSAGES[-1][2] + SECOND
+    with SessionWriter(tmp_path / 'session') as writer:
+        write(writer, [*MESSAGES, *shifted(MESSAGES[3:6], 58, later)])  # 2 s after the beginning of trial 1
+    trials, refusals = session_trials(read_session(writer.path), Options())
+    assert [trial.name for trial in trials] == ['trial 1', 'trial 2', 'trial 3', 'trial 4']
+    assert [len(trial.goals) for trial in trials] == [1, 1, 1, 1]
+    refusal, = refusals
+    assert refusal.startswith('the clock went back by ')
+
+
+def test_a_recording_that_was_played_twice_gives_each_trial_once(tmp_path):
+    with SessionWriter(tmp_path / 'session') as writer:
+        write(writer, [*MESSAGES, *shifted(MESSAGES, 0, MESSAGES[-1][2] + SECOND)])
+    trials, refusals = session_trials(read_session(writer.path), Options())
+    assert len(trials) == 3
+    assert any('9 message(s) after the clock went back repeat earlier ones' in refusal for refusal in refusals)

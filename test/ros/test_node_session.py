@@ -465,3 +465,69 @@ def test_a_reset_while_a_trial_is_appraised_forgets_it(start):
     assert graph.session.request('reset')[0]
     graph.until(lambda: not appraiser.alive)
     assert (graph.status['last_trial'], graph.status['trials']) == ('', '0')
+
+
+def back(pairs, seconds=5):
+    """Return the pairs, stamped earlier."""
+    for _, message in pairs:
+        message.header.stamp.sec -= seconds
+    return pairs
+
+
+def test_a_clock_that_went_back_begins_another_session_and_trials_never_mix(start, tmp_path, command):
+    graph = start()
+    graph.send(session_messages(TYPES, 2))
+    graph.send(back(session_messages(TYPES, 1), 50))  # within the first trial
+    first, second = folders(tmp_path)
+    told = graph.status['last_refusal']
+    assert told.startswith('the clock went back by ')
+    assert told.endswith(f'the 2 trial(s) of the former one are in {first}')
+    assert graph.logged['warn'] == [told]
+    assert (graph.status['state'], graph.status['trials']) == ('collecting', '1')
+    live = graph.calibrated()
+    assert whole(live)['trials'] == '1'
+    assert score(command, second) == whole(live)['score']
+    assert (len(read_session(first).trials), len(read_session(second).trials)) == (2, 1)
+
+
+def test_a_calibration_goes_on_when_the_clock_goes_back_and_its_result_lies_with_its_trials(
+        start, tmp_path, command):
+    graph = start(ToySimulator(0.005))
+    graph.send(session_messages(TYPES, 2))
+    graph.session.request('start')
+    graph.send(back(session_messages(TYPES, 1)))
+    assert (graph.status['state'], graph.status['trials']) == ('calibrating', '1')
+    graph.until(lambda: graph.status['state'] == 'done')
+    live, = graph.heard['result']
+    assert whole(live)['trials'] == '2'
+    assert 'of the session before the clock went back' in graph.status['detail']
+    first, second = folders(tmp_path)
+    assert (first / 'result.xml').exists() and not (second / 'result.xml').exists()
+    assert score(command, first) == whole(live)['score']
+    assert len(read_session(first).outputs('result')) == 1
+    assert read_session(first).problems == ()
+    assert whole(graph.calibrated())['trials'] == '1'
+    assert (second / 'result.xml').exists()
+
+
+def test_initial_chains_of_a_clock_that_went_back_are_forgotten_without_another_session(start, tmp_path):
+    graph = start()
+    stream = [session_messages(TYPES, 1, first=k)[0] for k in (3, 4)]
+    graph.send(stream)
+    graph.send(session_messages(TYPES, 1))
+    assert graph.status['trials'] == '1'
+    folder, = folders(tmp_path)
+    graph.session.close()
+    assert len(read_session(folder).trials) == 1
+
+
+def test_log_times_never_go_back_though_the_clock_of_the_machine_does(start, tmp_path, monkeypatch):
+    graph = start()
+    graph.send(session_messages(TYPES, 1))
+    monkeypatch.setattr(time, 'time_ns', lambda: 1_000_000_000)
+    monkeypatch.setattr(time, 'time', lambda: 1.0)
+    live = graph.calibrated()
+    folder, = folders(tmp_path)
+    session = read_session(folder)
+    assert session.records[-1].name == 'status'
+    assert whole(live)['trials'] == str(len(session.trials)) == '1'

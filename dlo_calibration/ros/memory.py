@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Memory: what a session of the node remembers."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.progress import Progress
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.inference.trial_information import TrialInformation
+from dlo_calibration.messages.collector import KEPT
+from dlo_calibration.messages.refusals import Refusals
+
+
+@dataclass
+class Pace:
+    """
+    When to repeat something that is repeated if needed, but not too often.
+
+    :param wanted: whether it is needed.
+    :param last: time when it was done last [s].
+    """
+
+    wanted: bool = False
+    last: float = float('-inf')
+
+
+@dataclass
+class Memory:
+    """
+    What a reset forgets, besides the trials.
+
+    :param detail: about the state, e.g. why the calibration failed.
+    :param refusals: the latest ones, which are not reported again.
+    :param counted: the same, by their reason.
+    :param heard: time of the last action or goal chain [s].
+    :param started: whether a calibration was started, so that `start_after_trials` starts none.
+    :param status: content of the last ``~/status``.
+    :param result: of the last calibration.
+    :param information: about the newest trial that was appraised.
+    """
+
+    state: str = 'collecting'
+    detail: str = ''
+    last_refusal: str = ''
+    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
+    counted: Refusals = field(default_factory=Refusals)
+    heard: float = float('-inf')
+    started: bool = False
+    status: dict[str, Any] = field(default_factory=dict)
+    result: CalibrationResult | None = None
+    information: TrialInformation | None = None
+    markers: Pace = field(default_factory=Pace)
+    appraisal: Pace = field(default_factory=Pace)
+
+
+@dataclass
+class Calibration:
+    """
+    A calibration under way.
+
+    :param memory: of the session in which it started, which may have ended since.
+    :param sent: time of its last progress message [s].
+    """
+
+    options: Options
+    progress: Progress
+    memory: Memory
+    sent: float = float('-inf')
