@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, OUR_RECORD, typestore
+from dlo_calibration.messages.codec import INPUT_TYPES
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,21 @@ class Bag:
         self.records: list[Record] = []
         self.options: dict[str, Any] | None = None
         self.problems: list[str] = []
+        self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
         self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
 
     def unusable(self, came: str, expected: str, remedy: str) -> InputError:
         """Return the error for a source that cannot be read at all."""
         return InputError(f'session {self.path}', came, expected, remedy)
+
+    def dropped(self) -> list[str]:
+        """Return a text for each kind of message of which the recording node dropped some."""
+        try:
+            counts = json.loads(self._dropped)
+            return [f'{int(counts[kind])} {kind} message(s) came faster than the node could read them, '
+                    'and were dropped' for kind in INPUT_TYPES if kind in counts]
+        except (ValueError, TypeError):
+            return []
 
     def used(self, inputs: Iterable[Record]) -> list[Record]:
         """
@@ -186,6 +197,8 @@ class Bag:
                 self.problems.append('recorded options that cannot be read are left out')
         if 'mark' in entries:
             self.marks.append((entries['mark'], len(self.records)))
+        if 'dropped' in entries:
+            self._dropped = entries['dropped']
 
     def _note_early_end(self, path: Path, before: int, error: Exception) -> None:
         """Note an early end of reading; raise an error where nothing was read."""

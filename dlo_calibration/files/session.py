@@ -114,10 +114,11 @@ def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...
     trials: list[Trial] = []
     known: dict[Key, Message] = {}
     for messages in clocks:
-        fresh = [one for one in messages if order_of(one) not in known or not _same(one, known[order_of(one)])]
+        fresh = [one for one in messages
+                 if order_of(one) not in known or not _same(one, known[order_of(one)])]
         if len(fresh) < len(messages):
-            refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat earlier '
-                            'ones: a recording that was played again is no second observation')
+            refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat '
+                            'earlier ones: a recording that was played again is no second observation')
         known |= {order_of(one): one for one in messages}
         found, problems = _collected(fresh, options)
         trials += found
@@ -181,6 +182,7 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
             messages.append((record.name, decode(record)))
         except InputError as error:
             problems.append(str(error))
+    problems += source.dropped()
     late = len(inputs) - len(used)
     if late:
         problems.append(f'{late} message(s) before the last reset or after the last start are left out, '

@@ -12,7 +12,8 @@ from __future__ import annotations
 import functools
 import logging
 import sys
-from typing import Any, Callable, Sequence
+import time
+from typing import Any, Callable, Mapping, Sequence
 
 import rclpy
 from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold, TimeJump
@@ -33,10 +34,13 @@ from dlo_calibration.errors import InputError, printable
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.messages.stamp_order import MARGIN
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
+from dlo_calibration.ros.inbox import Inbox
 from dlo_calibration.ros.parameters import OptionsNode
 from dlo_calibration.ros.session import CalibrationSession, DEFECT
 
 LOG = logging.getLogger('dlo_calibration')  # where the rest of the package logs its notices
+ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole
+SLICE = 0.02  # s of collecting between two looks at the queues, which overflow in 0.1 s in a flood
 TICK = 0.05  # s between two ticks of the session, short enough for its shortest period (progress)
 
 
@@ -110,6 +114,9 @@ class CalibratorNode(OptionsNode):
                          for name, kind in OUTPUT_TYPES.items()}
         self._input_classes = {kind: types.find(name) for kind, name in INPUT_TYPES.items()}
         self.session = CalibrationSession(self, types, make_simulator)
+        self._inbox = Inbox()
+        self._working = False
+        self._more = self.create_guard_condition(self._work)
         self._closed = False
         self._incompatible: set[str] = set()  # inputs that a best-effort publisher cannot reach
         self._inputs = {kind: self._subscribe(kind, ReliabilityPolicy.RELIABLE) for kind in INPUT_TYPES}
@@ -129,6 +136,13 @@ class CalibratorNode(OptionsNode):
         self._closed = True
         LOG.removeHandler(self._notices)
         try:
+            for kind, subscription in self._inputs.items():
+                self._drain(kind, subscription)
+            while len(self._inbox):
+                kind, octets = self._inbox.take()
+                if octets is not None:
+                    self.session.keep(kind, octets)
+            self.session.drop(self._inbox.take_dropped())
             self.session.close()
         except (InvalidHandle, RuntimeError) as error:  # the context was shut down by somebody else
             self.get_logger().debug(repr(error))
@@ -149,10 +163,47 @@ class CalibratorNode(OptionsNode):
     def _subscribe(self, kind: str, reliability: ReliabilityPolicy) -> Any:
         # The queue holds a burst of goal chains while another callback works.
         return self.create_subscription(
-            self._input_classes[kind], f'~/{kind}', functools.partial(self.session.hear, kind),
+            self._input_classes[kind], f'~/{kind}', functools.partial(self._hear, kind),
             QoSProfile(depth=2000, reliability=reliability), raw=True,
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self._on_incompatible_qos, kind)))
+                incompatible_qos=functools.partial(self._on_incompatible_qos, kind),
+                message_lost=functools.partial(self._on_message_lost, kind),
+                matched=functools.partial(self._on_matched, kind)))
+
+    def _hear(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
+        self._inbox.put(kind, octets, info['publication_sequence_number'])
+        self._drain(kind, self._inputs[kind])
+        self._work()
+
+    def _work(self, seconds: float = SLICE) -> None:
+        """Collect waiting messages for some time, and see to it that the others are collected soon."""
+        self._working = True
+        until = time.monotonic() + seconds
+        try:
+            while len(self._inbox) and time.monotonic() < until:
+                kind, octets = self._inbox.take()
+                if octets is None:
+                    done, answer = self.session.request(kind)
+                    if done:
+                        self.info(answer)
+                else:
+                    self.session.hear(kind, octets, flush=False)
+        finally:
+            self._working = False
+            self.session.flush()
+        self.session.behind = len(self._inbox) > 0
+        if self.session.behind:
+            self._more.trigger()
+
+    def _on_message_lost(self, kind: str, event: Any) -> None:
+        if not self._inbox.numbered(kind):  # else the numbers tell it, and more
+            self._inbox.drop(kind, event.total_count_change)
+
+    def _on_matched(self, kind: str, event: Any) -> None:
+        if event.current_count == 0:
+            self._drain(kind, self._inputs[kind])
+            self._inbox.forget_publishers(kind)
+            self._more.trigger()
 
     def _on_incompatible_qos(self, kind: str, event: Any) -> None:
         if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
@@ -172,20 +223,29 @@ class CalibratorNode(OptionsNode):
             self.info(f'{kind}: a publisher offers best effort only, so the node subscribes with best effort')
 
     def _drain(self, kind: str, subscription: Any) -> None:
-        """Pass the messages in a subscription's queue to the session."""
+        """Put the messages in a subscription's queue into the inbox."""
+        until = time.monotonic() + SLICE  # a publisher may be as fast as this loop
         with subscription.handle:
-            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-                self.session.hear(kind, taken[0])
+            while time.monotonic() < until \
+                    and (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                self._inbox.put(kind, taken[0], taken[1]['publication_sequence_number'])
 
     # Services, the timer and the clock
 
     def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self.session.request(name)
+        self.hear_waiting()
+        if name == 'stop' or not len(self._inbox):
+            response.success, response.message = self.session.request(name)
+        else:
+            response.success, response.message = True, \
+                f'{len(self._inbox)} messages came before; {name} follows when they are read'
+            self._inbox.put_request(name)
         return response
 
     def _tick(self) -> None:
         try:
             self._subscribe_best_effort()
+            self.session.drop(self._inbox.take_dropped())
             self.session.tick()
         except Exception as error:  # a callback that raises would end the node
             self.session.fail(f'{error!r}; {DEFECT}')
@@ -218,9 +278,12 @@ class CalibratorNode(OptionsNode):
         self._outputs[name].publish(octets)
 
     def hear_waiting(self) -> None:
-        """Pass on the messages that wait in the queues of the subscriptions."""
+        """Pass on the messages that wait, as far as that takes less than the time for an answer."""
+        if self._working:
+            return
         for kind, subscription in self._inputs.items():
             self._drain(kind, subscription)
+        self._work(ANSWER)
 
     def info(self, text: str) -> None:
         """Log a text."""

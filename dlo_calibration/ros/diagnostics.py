@@ -90,7 +90,8 @@ def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
 
 
 def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_refusal: str = '',
-           incomplete: str = '', detail: str = '', information: TrialInformation | None = None) -> Any:
+           incomplete: str = '', detail: str = '', information: TrialInformation | None = None,
+           dropped: int = 0) -> Any:
     """
     Build the message about what the node is doing.
 
@@ -100,6 +101,7 @@ def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_ref
     :param incomplete: what the newest trial lacks; empty if it is complete.
     :param detail: about the state, e.g. why the calibration failed.
     :param information: about the newest trial; None until it is known.
+    :param dropped: number of messages that came faster than they can be read.
     """
     if state not in STATES:
         raise ValueError(f'{state!r} is not one of {", ".join(STATES)}')
@@ -110,7 +112,8 @@ def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_ref
     return _diagnostics(types, stamp, [_status(
         types, ERROR if state == 'failed' else OK, 'status', message,
         {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
-         'detail': detail, 'last_trial': last_trial, **({} if information is None else information.values)})])
+         'detail': detail, 'dropped': dropped, 'last_trial': last_trial,
+         **({} if information is None else information.values)})])
 
 
 def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:

@@ -32,7 +32,7 @@ class Graph(Protocol):
         """Publish bytes on an output topic."""
 
     def hear_waiting(self) -> None:
-        """Pass the messages in the queues of the input topics to the session."""
+        """Pass messages that wait to the session, for a moment only."""
 
     def info(self, text: str) -> None:
         """Log a text."""

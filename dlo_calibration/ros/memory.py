@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,6 +43,7 @@ class Memory:
     :param status: content of the last ``~/status``.
     :param result: of the last calibration.
     :param information: about the newest trial that was appraised.
+    :param dropped: how many messages of each kind were dropped; `told_dropped`: as told `telling.last`.
     """
 
     state: str = 'collecting'
@@ -55,6 +56,9 @@ class Memory:
     status: dict[str, Any] = field(default_factory=dict)
     result: CalibrationResult | None = None
     information: TrialInformation | None = None
+    dropped: Counter[str] = field(default_factory=Counter)
+    told_dropped: Counter[str] = field(default_factory=Counter)
+    telling: Pace = field(default_factory=Pace)
     markers: Pace = field(default_factory=Pace)
     appraisal: Pace = field(default_factory=Pace)
 

@@ -10,8 +10,9 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
+from collections import Counter
 import time
-from typing import Any, Callable
+from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import LiveInformation
@@ -63,6 +64,7 @@ class CalibrationSession:
         self._calibration: Calibration | None = None
         self._order = StampOrder()
         self._began = self._clock()
+        self.behind = False  # whether messages wait that came before; an appraisal would delay them
         self._begin_recording()
         self._report()
 
@@ -89,6 +91,14 @@ class CalibrationSession:
             self.refuse(problem)
         elif not self.calibrating:
             self._memory.state, self._memory.detail = 'collecting', ''
+
+    def drop(self, counts: Mapping[str, int]) -> None:
+        """Take note of messages of some kinds that came, and were dropped."""
+        self._memory.dropped.update(counts)
+
+    def keep(self, kind: str, octets: bytes) -> None:
+        """Record a message, as no time is left to collect it."""
+        self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush=False)
 
     def flush(self) -> None:
         """Give the recorded messages to the operating system."""
@@ -117,6 +127,7 @@ class CalibrationSession:
         self._take_events()
         self._recorder.tell()
         self._tell_refusals(self._memory.counted.due(self._clock()))
+        self._tell_dropped()
         self._start_by_itself()
         self._appraise()
         # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
@@ -138,6 +149,7 @@ class CalibrationSession:
         self._worker.stop()
         self._appraiser.stop()
         try:
+            self._tell_dropped(at_once=True)
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
                 self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
@@ -246,6 +258,7 @@ class CalibrationSession:
 
     def _forget(self) -> None:
         """Begin another session; a calibration under way goes on."""
+        self._tell_dropped(at_once=True)
         self._recorder.end()
         self._appraiser.stop()
         self._collected_with = self._graph.options()
@@ -308,12 +321,23 @@ class CalibrationSession:
             memory.information = information
         quiet = now - memory.heard > QUIET
         # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
-        if memory.appraisal.wanted and not self.calibrating and self._collector.count \
+        if memory.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
                 and not self._appraiser.alive and (quiet or now - memory.appraisal.last > 2.0):
             memory.appraisal = Pace(wanted=not quiet, last=now)
             self._appraiser.start(self._collector.trials, self._graph.options(), memory.result, whole=quiet)
 
     # Messages of the node
+
+    def _tell_dropped(self, at_once: bool = False) -> None:
+        """Tell how many messages were dropped, if that number has changed, at most once a second."""
+        memory, now = self._memory, self._clock()
+        if memory.dropped != memory.told_dropped and (at_once or now - memory.telling.last > 1.0):
+            memory.telling.last = now
+            for kind, count in (memory.dropped - memory.told_dropped).items():
+                self._graph.warn(f'{kind}: {count} message(s) were dropped, as they came faster than they '
+                                 'can be read; publish fewer a second')
+            memory.told_dropped = Counter(memory.dropped)
+            self._recorder.dropped(memory.dropped)
 
     def _send_progress(self, calibration: Calibration) -> None:
         """Send the newest evaluation, unless it has been sent."""
@@ -332,7 +356,7 @@ class CalibrationSession:
         content: dict[str, Any] = {
             'state': memory.state, 'trials': self._collector.count, 'last_refusal': memory.last_refusal,
             'incomplete': self._collector.incomplete, 'detail': memory.detail,
-            'information': memory.information}
+            'information': memory.information, 'dropped': memory.told_dropped.total()}
         if content != memory.status:
             memory.status = content
             self._send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))

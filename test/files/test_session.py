@@ -607,4 +607,4 @@ def test_a_recording_that_was_played_twice_gives_each_trial_once(tmp_path):
         write(writer, [*MESSAGES, *shifted(MESSAGES, 0, MESSAGES[-1][2] + SECOND)])
     trials, refusals = session_trials(read_session(writer.path), Options())
     assert len(trials) == 3
-    assert any('9 message(s) after the clock went back repeat earlier ones' in refusal for refusal in refusals)
+    assert any('9 message(s) after the clock went back repeat earlier ones' in one for one in refusals)

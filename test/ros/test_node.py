@@ -332,3 +332,23 @@ def test_bad_command_line_ends_the_process(ros_environment, tmp_path):
         output, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, output) == (2, '')
     assert one_line(errors)
+
+
+def test_what_a_flood_drops_is_counted_and_told(start_node, tmp_path, capsys):
+    robot = start_node()
+    initial, action, (_, goal) = session_messages(TYPES, 1)
+    robot.send([initial, action, (GOAL, goal)])
+    robot.until_status(trials='1')
+    seconds = goal.header.stamp.sec
+    for k in range(1, 3000):  # the node does nothing meanwhile, as it shares this thread
+        goal.header.stamp.sec, goal.header.stamp.nanosec = seconds + k // 1000, k % 1000 * 1_000_000
+        robot.publishers[GOAL].publish(goal)
+    robot.until(lambda: int(robot.status['dropped']), 'nothing was dropped')
+    robot.until(lambda: not len(robot.calibrator._inbox))
+    robot.until(lambda: any('message(s) were dropped' in log.msg for log in robot.heard['log']))
+    robot.calibrator.close()
+    folder, = folders(tmp_path)
+    heard = sum(record.name == GOAL for record in read_session(folder).records)
+    assert heard + int(robot.status['dropped']) == 3000
+    assert cli.main(['info', str(folder)]) == 0
+    assert f'{robot.status["dropped"]} goal_chain message(s) came faster' in capsys.readouterr().out
