@@ -33,19 +33,19 @@ class StampOrder:
     - before two other messages, as a single wrong stamp in the future is no clock.
 
     An initial chain that goes back tells that the clock did.  An action or a goal chain that does may
-    belong to either clock, so it is refused.  So are messages that were still under way as the clock went
-    back: they are stamped near the end of the former clock, on a topic that has not yet gone back.
+    belong to either clock, so it is refused.
 
-    :param former: the newest stamp before the clock went back [ns]; 0: it never did.
+    :param former: the order before the clock went back; None: it never did.
     """
 
-    def __init__(self, former: int = 0) -> None:
+    def __init__(self, former: StampOrder | None = None) -> None:
         self._frame = ''
         self._newest: dict[str, int] = {}  # of each topic
         self._latest: list[int] = [0]  # the two newest of all topics
         self._first: float = math.inf  # of the initial chains
-        self._former = former
-        self._waiting = set(INPUT_TYPES) if former else set()  # topics that have not yet gone back
+        self._former_end = 0 if former is None else former.newest
+        self._ahead = {} if former is None else {  # newest stamps on the topics that have not yet gone back
+            kind: former._newest.get(kind, 0) for kind in INPUT_TYPES}
 
     @property
     def newest(self) -> int:
@@ -56,6 +56,15 @@ class StampOrder:
         """Tell whether the clock went back before this message."""
         return message.kind == INITIAL and message.frame_id == self._frame and self._goes_back(message)
 
+    def left_over(self, message: Message) -> bool:
+        """
+        Tell whether this message was stamped before the clock went back, and was under way then.
+
+        It is stamped near the end of the former clock, on a topic that has not yet gone back.
+        """
+        return (message.kind in self._ahead and message.stamp > self._ahead[message.kind]
+                and abs(message.stamp - self._former_end) <= MARGIN and message.stamp > self.newest + MARGIN)
+
     def check(self, message: Message) -> None:
         """
         Check that a message certainly belongs to the trials of the present clock.
@@ -64,17 +73,13 @@ class StampOrder:
         """
         if message.frame_id != self._frame:
             return  # the collector refuses it
-        remedy = 'stamp all messages with one clock, and send an initial_chain first after it went back'
-        if message.kind in self._waiting and abs(message.stamp - self._former) <= MARGIN \
-                and message.stamp > self.newest + MARGIN:
-            raise InputError(str(message), 'a stamp from before the clock went back',
-                             'one of the present clock', remedy)
         # What is stamped before all trials can be used by none; the collector refuses it.
         if message.kind != INITIAL and message.stamp > self._first and self._goes_back(message):
             earlier = (self._newest[message.kind] - message.stamp) / NANOSECONDS
             raise InputError(
                 str(message), f'it {earlier:.6g} s before the newest {message.kind}, in an earlier trial',
-                'the order of stamps on each topic', remedy)
+                'the order of stamps on each topic',
+                'stamp all messages with one clock, and send an initial_chain first after it went back')
 
     def _goes_back(self, message: Message) -> bool:
         return (message.stamp < self._newest.get(message.kind, 0) - MARGIN
@@ -82,7 +87,7 @@ class StampOrder:
 
     def after_jump(self) -> StampOrder:
         """Return the order of the messages from now on, as the clock went back."""
-        return StampOrder(self.newest)
+        return StampOrder(self)
 
     def add(self, message: Message) -> None:
         """Take a message that `check` does not refuse; ignore one in another frame than the first."""
@@ -91,8 +96,8 @@ class StampOrder:
             return
         if message.kind == INITIAL:
             self._first = min(self._first, message.stamp)
-        if message.stamp < self._former - MARGIN:
-            self._waiting.discard(message.kind)
+        if message.stamp < self._former_end - MARGIN:
+            self._ahead.pop(message.kind, None)
         self._newest[message.kind] = max(self._newest.get(message.kind, 0), message.stamp)
         self._latest = nlargest(2, {*self._latest, message.stamp})
 

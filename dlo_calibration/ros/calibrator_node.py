@@ -35,6 +35,7 @@ from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.messages.stamp_order import MARGIN
 from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.inbox import Inbox
+from dlo_calibration.ros.memory import Pace
 from dlo_calibration.ros.parameters import OptionsNode
 from dlo_calibration.ros.session import CalibrationSession, DEFECT
 
@@ -116,6 +117,7 @@ class CalibratorNode(OptionsNode):
         self.session = CalibrationSession(self, types, make_simulator)
         self._inbox = Inbox()
         self._working = False
+        self._namesakes = Pace()  # wanted: one is there, and was told
         self._more = self.create_guard_condition(self._work)
         self._closed = False
         self._incompatible: set[str] = set()  # inputs that a best-effort publisher cannot reach
@@ -124,7 +126,9 @@ class CalibratorNode(OptionsNode):
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         # A steady clock: with use_sim_time and no /clock, a timer on the node's own clock would never fire.
         self.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.get_clock().create_jump_callback(
+        self._jump: TimeJump | None = None  # of the node's clock, back
+        # rclpy calls nobody, or crashes, where this is not kept.
+        self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-MARGIN)),
             post_callback=self._on_jump)
         self.info('collecting trials; call ~/start to calibrate')
@@ -134,6 +138,7 @@ class CalibratorNode(OptionsNode):
         if self._closed:
             return
         self._closed = True
+        self._jumps.unregister()
         LOG.removeHandler(self._notices)
         try:
             for kind, subscription in self._inputs.items():
@@ -171,6 +176,7 @@ class CalibratorNode(OptionsNode):
                 matched=functools.partial(self._on_matched, kind)))
 
     def _hear(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
+        self._after_jump()
         self._inbox.put(kind, octets, info['publication_sequence_number'])
         self._drain(kind, self._inputs[kind])
         self._work()
@@ -244,15 +250,35 @@ class CalibratorNode(OptionsNode):
 
     def _tick(self) -> None:
         try:
+            self._after_jump()
             self._subscribe_best_effort()
             self.session.drop(self._inbox.take_dropped())
+            self._look_for_namesakes()
             self.session.tick()
         except Exception as error:  # a callback that raises would end the node
             self.session.fail(f'{error!r}; {DEFECT}')
 
+    def _look_for_namesakes(self) -> None:
+        """Tell, once, that another node has the same name; look once a second, as it may come later."""
+        if time.monotonic() - self._namesakes.last < 1.0:
+            return
+        self._namesakes.last = time.monotonic()
+        names = self.get_node_names_and_namespaces()
+        several = names.count((self.get_name(), self.get_namespace())) > 1
+        if several and not self._namesakes.wanted:
+            self.refuse(f'node: got another node named {self.get_fully_qualified_name()}, which hears and '
+                        'answers the same, expected one; start one of them with another name, '
+                        '--ros-args -r __node:=NAME')
+        self._namesakes.wanted = several
+
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.clock_change == ClockChange.ROS_TIME_NO_CHANGE:
-            now = self.stamp()
+            self._jump = jump
+
+    def _after_jump(self) -> None:
+        """Begin another session if the node's clock went back; not in the callback, inside the clock."""
+        if self._jump is not None:
+            jump, self._jump, now = self._jump, None, self.stamp()
             self.session.clock_went_back(now - jump.delta.nanoseconds, now)
 
     # The graph of the session

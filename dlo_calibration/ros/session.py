@@ -36,6 +36,7 @@ from dlo_calibration.ros.recorder import Recorder
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
+UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
 OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
 DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
 
@@ -82,6 +83,10 @@ class CalibrationSession:
         message, problem = self._read(kind, octets)
         if message is not None and self._order.clock_went_back(message):
             self._begin_anew(went_back(self._order.newest, message.stamp))
+        if message is not None and self._clock() - self._began < UNDER_WAY and self._order.left_over(message):
+            self.refuse(f'{message}: got a stamp from before the clock went back, expected a later one; '
+                        'it belongs to the former session')
+            return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
         if kind != INITIAL:
             self._memory.heard = self._clock()
@@ -185,13 +190,13 @@ class CalibrationSession:
 
     def clock_went_back(self, before: int, now: int) -> None:
         """Begin another session, as the node's clock went from one time [ns] back to another."""
-        if self._clock() - self._began > 1.0:  # else the stamps of messages told it first
+        if self._clock() - self._began > UNDER_WAY:  # else the stamps of messages told it first
             self._graph.hear_waiting()
             self._begin_anew(went_back(before, now))
 
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
-        self._order = self._order.after_jump()
+        self._order, self._began = self._order.after_jump(), self._clock()
         if self._memory.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self._collector.clear()
             self._graph.warn(why)

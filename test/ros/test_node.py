@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from result_message import result_values
 from serial import serial
+from rosgraph_msgs.msg import Clock
 from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
@@ -352,3 +353,44 @@ def test_what_a_flood_drops_is_counted_and_told(start_node, tmp_path, capsys):
     assert heard + int(robot.status['dropped']) == 3000
     assert cli.main(['info', str(folder)]) == 0
     assert f'{robot.status["dropped"]} goal_chain message(s) came faster' in capsys.readouterr().out
+
+
+def test_another_node_of_the_same_name_is_told_once_with_the_remedy(start_node, tmp_path):
+    robot = start_node()
+    first = robot.calibrator
+    try:
+        start_node()
+        robot.until(lambda: any('another node named /calibrator' in log.msg and '__node:=NAME' in log.msg
+                                for log in robot.heard['log']))
+        robot.until(lambda: 'another node named' in robot.status.get('last_refusal', ''))
+    finally:
+        first.close()
+    assert len(folders(tmp_path)) == 2  # each has a session of its own
+
+
+def test_simulated_time_that_jumps_back_begins_another_session(start_node, tmp_path):
+    robot = start_node(use_sim_time=True)
+    clock = robot.node.create_publisher(Clock, '/clock', 10)
+
+    def tell(seconds):
+        message = Clock()
+        message.clock.sec = seconds
+        clock.publish(message)
+        robot.until(lambda: robot.calibrator.stamp() == seconds * 10**9)
+
+    robot.until(lambda: clock.get_subscription_count())
+    tell(60)
+    robot.send(session_messages(TYPES, 1))
+    robot.until_status(trials='1')
+    tell(90)
+    assert len(folders(tmp_path)) == 1
+    begun = time.monotonic()
+    robot.until(lambda: time.monotonic() - begun > 1.1)
+    tell(50)
+    robot.until_status(trials='0')
+    assert robot.status['last_refusal'].startswith(
+        'the clock went back by 40 s (from 90.000 to 50.000): a new session begins')
+    robot.send(session_messages(TYPES, 1))  # the same stamps again
+    robot.until_status(trials='1')
+    robot.calibrator.close()
+    assert [len(read_session(folder).trials) for folder in folders(tmp_path)] == [1, 1]
