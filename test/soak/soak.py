@@ -24,7 +24,9 @@ sys.path += [str(FOLDER.parent / 'support'), str(FOLDER)]
 
 CAMPAIGNS: tuple[str, ...] = (
     'disk',
+    'flood',
     'interrupt',
+    'kill',
     'scenes',
 )
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')

@@ -45,6 +45,14 @@ class Tally:
                 f'{self.peak / MEGABYTE:.0f} MB', f'{self.silence:.2f} s')
 
 
+def peak_of(pid: int) -> int:
+    """Return the largest resident memory of a process so far [bytes]."""
+    for line in Path(f'/proc/{pid}/status').read_text().splitlines():
+        if line.startswith('VmHWM:'):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
 @dataclass(frozen=True)
 class Ended:
     """

@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Flood: messages from tiny to the largest that are allowed, on all topics, as fast as they can be sent.
+
+Lost: messages that the node neither recorded nor counts as dropped.  Died: a node that ends by itself, or
+not within a minute after SIGTERM.  Silence: the longest time until a request was answered.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import signal
+import subprocess
+import time
+
+from domain import ros_graph
+import numpy as np
+from tally import peak_of, Tally
+from toy_messages import MINUTE, session_messages
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.session import read_session
+from dlo_calibration.messages.codec import (
+    ACTION,
+    chain_cloud,
+    INITIAL,
+    INPUT_TYPES,
+    MAXIMUM_POINTS,
+)
+from dlo_calibration.model.chain import Chain
+
+SHORT, FULL = 3, 130
+BURST = 3000  # messages, or as many as these bytes hold
+BURST_BYTES = 60_000_000
+QUIET = 3.0  # s without a new message in the node's count, after which all have come
+
+
+def conduct(amount: int, seed: int, folder: Path) -> Tally:
+    """Send `amount` bursts to one node, and a request after each."""
+    from graph import child, robot_of, TYPES
+
+    tally, choose = Tally(), random.Random(seed)
+    with ros_graph(folder) as environment, child(environment, folder / 'out') as process, \
+            robot_of(environment) as robot:
+        sent = 0
+        for kind, message in session_messages(TYPES, 1):  # so that the numbers of all publishers are known
+            robot.send([(kind, message)])
+            sent += 1
+        robot.until_status(trials='1')
+        sizes = _messages(TYPES)
+        try:
+            for k in range(amount):
+                kind, message, size = sizes[k % len(sizes)]
+                sent += _burst(robot, kind, message, min(BURST, BURST_BYTES // size), choose)
+                begun = time.monotonic()
+                robot.call('stop')
+                tally.remember(silence=time.monotonic() - begun, peak=peak_of(process.pid))
+                tally.tried += 1
+            _wait(robot)
+            tally.remember(peak=peak_of(process.pid))
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=60.0)
+            tally.died += process.returncode != 0
+        except (AssertionError, OSError, subprocess.TimeoutExpired):
+            tally.died += 1
+    try:
+        session_folder, = (folder / 'out').glob('dlo_session_*')
+        session = read_session(session_folder)
+        heard = sum(record.name in INPUT_TYPES for record in session.records)
+        tally.refused = _dropped(session)
+        tally.lost = abs(sent - heard - tally.refused)
+    except (InputError, ValueError):
+        tally.lost = sent
+    return tally
+
+
+def _messages(types):
+    """Return (kind, message, bytes) of all topics, from tiny to the largest."""
+    from rclpy.serialization import serialize_message
+
+    (_, chain), (_, action), (_, goal) = session_messages(types, 1)
+    tiny = chain_cloud(types, Chain(np.eye(3)), MINUTE, 'world')
+    rows = np.zeros((MAXIMUM_POINTS, 3))
+    rows[:, 0] = np.linspace(0, 1, MAXIMUM_POINTS)
+    largest = chain_cloud(types, Chain(rows), MINUTE, 'world')
+    long = types.build(INPUT_TYPES[ACTION], header=action.header, joint_names=action.joint_names,
+                       points=list(action.points) * 2000)
+    return [(kind, message, len(serialize_message(message)))
+            for kind, message in (('goal_chain', goal), (INITIAL, largest), (ACTION, action),
+                                  ('goal_chain', largest), (INITIAL, tiny), (ACTION, long), (INITIAL, chain))]
+
+
+def _burst(robot, kind, message, count, choose):
+    """Publish one message with many stamps, none before another trial; return how often."""
+    for _ in range(count):
+        message.header.stamp.sec = MINUTE // 10**9 + choose.randrange(2, 50)
+        message.header.stamp.nanosec = choose.randrange(10**9)
+        robot.publishers[kind].publish(message)
+    return count
+
+
+def _wait(robot):
+    """Wait until the node's status no longer changes."""
+    seen, since = -1, time.monotonic()
+    while time.monotonic() - since < QUIET:
+        robot.executor.spin_once(timeout_sec=0.05)
+        if len(robot.heard['status']) != seen:
+            seen, since = len(robot.heard['status']), time.monotonic()
+
+
+def _dropped(session):
+    """Return how many messages the node counts as dropped, as `info` tells."""
+    return sum(int(text.split()[0]) for text in session.problems if text.endswith('were dropped'))

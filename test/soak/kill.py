@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Kill: kill -9 to the node while it collects, calibrates or writes a result, and to processes that simulate.
+
+Lost: a trial that the node told of and that its session does not give back, a result that is cut, or another
+result after a process that simulates was killed.  Died: a node that ends by itself, or leaves one behind.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import random
+import signal
+import time
+
+from domain import ros_graph
+from processes import children
+from tally import peak_of, Tally
+from toy_messages import session_messages
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.result import read_result
+from dlo_calibration.files.session import read_session, session_trials
+
+SHORT, FULL = 2, 110
+ORPHANED = 5.0  # s that a process may outlive the node
+MOMENTS = ('calibrating', 'a process', 'writing', 'collecting')
+EVALUATIONS = {'calibrating': 10000, 'a process': 60, 'writing': 20, 'collecting': 20}
+TRIALS = 2  # before the calibration
+
+
+def conduct(amount: int, seed: int, folder: Path) -> Tally:
+    """Kill `amount` times, at the moments in turn."""
+    tally, choose = Tally(), random.Random(seed)
+    scores: set[str] = set()  # of calibrations of which processes were killed
+    for k in range(amount):
+        moment = MOMENTS[k % len(MOMENTS)]
+        tally.tried += 1
+        try:
+            with _node(folder / f'{k}', EVALUATIONS[moment]) as (process, robot):
+                if moment == 'a process':
+                    scores.add(_kill_a_process(process, robot, choose))
+                else:
+                    _kill_the_node(process, robot, moment, choose, tally)
+        except AssertionError:  # it ended, or never answered
+            tally.died += 1
+            continue
+        if moment != 'a process':
+            tally.lost += _lost(folder / f'{k}' / 'out', robot)
+    tally.lost += max(len(scores) - 1, 0)
+    return tally
+
+
+@contextmanager
+def _node(folder, evaluations):
+    """Give a node that has collected two trials, and its robot."""
+    from graph import child, robot_of, TYPES
+
+    folder.mkdir()
+    with ros_graph(folder) as environment, child(
+            environment, folder / 'out', '-p', 'workers:=2', '-p', f'evaluations:={evaluations}',
+            '-p', 'search:=random', seconds=0.01) as process, robot_of(environment) as robot:
+        robot.send(session_messages(TYPES, TRIALS))
+        robot.until_status(trials=f'{TRIALS}')
+        yield process, robot
+
+
+def _simulating(process):
+    return [one for one, words in children(process.pid).items() if 'spawn_main' in words]
+
+
+def _kill_a_process(process, robot, choose):
+    """Kill one of the processes that simulate; return the scores of the result."""
+    from graph import whole
+
+    assert robot.call('start').success
+    robot.until(lambda: robot.heard['progress'] and len(_simulating(process)) > 1)
+    try:
+        os.kill(choose.choice(_simulating(process)), signal.SIGKILL)
+    except ProcessLookupError:
+        pass  # the calibration has just ended
+    return whole(robot.until_result())['scores']
+
+
+def _kill_the_node(process, robot, moment, choose, tally):
+    from graph import TYPES
+
+    if moment == 'collecting':
+        stream = (pair for k in range(TRIALS, 40) for pair in session_messages(TYPES, 1, first=k))
+    else:
+        stream = iter(())
+        assert robot.call('start').success
+        if moment == 'calibrating':
+            robot.until(lambda: robot.heard['progress'])
+    end = time.monotonic() + choose.uniform(0.0, 2.0)
+    while time.monotonic() < end:
+        for kind, message in stream:
+            robot.publishers[kind].publish(message)
+            break
+        robot.executor.spin_once(timeout_sec=0.01)
+    assert process.poll() is None
+    tally.remember(peak=peak_of(process.pid))
+    started = list(children(process.pid))
+    process.kill()
+    process.wait()
+    begun = time.monotonic()
+    while any(Path(f'/proc/{pid}').exists() for pid in started):
+        if time.monotonic() - begun > ORPHANED:
+            tally.died += 1
+            return
+        time.sleep(0.02)
+
+
+def _lost(out, robot):
+    """Return how much of what the robot was told is not in the session's folder."""
+    try:
+        folder, = out.glob('dlo_session_*')
+        session = read_session(folder)
+        trials, _ = session_trials(session, Options())
+        for path in folder.glob('*.xml'):
+            read_result(path)
+        results = len(robot.heard['result']) - len(session.outputs('result'))
+        told = TRIALS if robot.heard['progress'] else int(robot.status['trials'])
+        return max(told - len(trials), 0) + max(results, 0)
+    except (InputError, ValueError):
+        return 1
