@@ -96,10 +96,11 @@ def test_progress_tells_the_best_so_far_and_what_is_left(types):
     ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
 def test_status_tells_state_trials_and_refusal(types, state, level):
     one, values = by_name(diagnostics.status(
-        types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why'
+        types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why',
+        dropped=5
     ))['status']
     assert values == {'state': state, 'trials': '3', 'last_refusal': 'too few', 'incomplete': 'a goal',
-                      'detail': 'why', 'last_trial': ''}
+                      'detail': 'why', 'dropped': '5', 'last_trial': ''}
     assert one.message == f'{state}: why'
     assert one.level == types.level(level)
 
