@@ -11,7 +11,6 @@ not within a minute after SIGTERM.  Silence: the longest time until a request wa
 from __future__ import annotations
 
 from pathlib import Path
-import random
 import signal
 import subprocess
 import time
@@ -35,6 +34,7 @@ from dlo_calibration.model.chain import Chain
 SHORT, FULL = 3, 130
 BURST = 3000  # messages, or as many as these bytes hold
 BURST_BYTES = 60_000_000
+LATER = 1000  # s, stamp of the first burst
 QUIET = 3.0  # s without a new message in the node's count, after which all have come
 
 
@@ -42,7 +42,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
     """Send `amount` bursts to one node, and a request after each."""
     from graph import child, robot_of, TYPES
 
-    tally, choose = Tally(), random.Random(seed)
+    tally = Tally()
     with ros_graph(folder) as environment, child(environment, folder / 'out') as process, \
             robot_of(environment) as robot:
         sent = 0
@@ -51,10 +51,11 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             sent += 1
         robot.until_status(trials='1')
         sizes = _messages(TYPES)
+        sizes = sizes[seed % len(sizes):] + sizes[:seed % len(sizes)]
         try:
             for k in range(amount):
                 kind, message, size = sizes[k % len(sizes)]
-                sent += _burst(robot, kind, message, min(BURST, BURST_BYTES // size), choose)
+                sent += _burst(robot, kind, message, min(BURST, BURST_BYTES // size), sent)
                 begun = time.monotonic()
                 robot.call('stop')
                 tally.remember(silence=time.monotonic() - begun, peak=peak_of(process.pid))
@@ -93,11 +94,11 @@ def _messages(types):
                                   ('goal_chain', largest), (INITIAL, tiny), (ACTION, long), (INITIAL, chain))]
 
 
-def _burst(robot, kind, message, count, choose):
-    """Publish one message with many stamps, none before another trial; return how often."""
-    for _ in range(count):
-        message.header.stamp.sec = MINUTE // 10**9 + choose.randrange(2, 50)
-        message.header.stamp.nanosec = choose.randrange(10**9)
+def _burst(robot, kind, message, count, sent):
+    """Publish one message `count` times, each a millisecond after the one before; return `count`."""
+    for number in range(sent, sent + count):
+        message.header.stamp.sec = LATER + number // 1000
+        message.header.stamp.nanosec = number % 1000 * 1_000_000
         robot.publishers[kind].publish(message)
     return count
 
