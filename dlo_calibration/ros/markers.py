@@ -23,6 +23,7 @@ from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9
 ADD, DELETE_ALL = 0, 3
 
+MOST_HANDS = 100  # drawn of a trial; a flood gives thousands, and drawing them would delay answers
 MOST_POINTS = 200  # drawn of a chain or path; closer points cannot be told apart on a screen
 
 # Red, green and blue from 0 to 1: they differ in hue, and are bright enough for a dark background.
@@ -80,7 +81,7 @@ def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -
         if chains is not None:
             yield brush.line('simulated', goal, chains[goal], SIMULATED_COLOUR)
             yield from _error_markers(brush, goal, points, chains[goal], trial.initial.length)
-    for place, hand in enumerate(trial.hands):
+    for place, hand in enumerate(trial.hands[:MOST_HANDS]):
         yield from _hand_markers(brush, 3 * place, hand, HAND_COLOURS[place % len(HAND_COLOURS)], trial)
     text = trial.name
     if chains is not None:

@@ -65,7 +65,7 @@ class CalibrationSession:
         self._calibration: Calibration | None = None
         self._order = StampOrder()
         self._began = self._clock()
-        self.behind = False  # whether messages wait that came before; an appraisal would delay them
+        self.behind = False  # whether messages wait; appraisals and markers would delay them
         self._begin_recording()
         self._report()
 
@@ -137,7 +137,7 @@ class CalibrationSession:
         self._appraise()
         # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
         period = 1.0 + 0.1 * self._collector.count
-        if self._memory.markers.wanted and self._collector.count \
+        if self._memory.markers.wanted and not self.behind and self._collector.count \
                 and self._clock() - self._memory.markers.last >= period:
             self._show()
         self._report()
