@@ -81,9 +81,9 @@ class CalibrationSession:
         :param flush: False where `flush` follows soon.
         """
         message, problem = self._read(kind, octets)
-        if message is not None and self._order.clock_went_back(message):
+        if message and self._order.clock_went_back(message):
             self._begin_anew(went_back(self._order.newest, message.stamp))
-        if message is not None and self._clock() - self._began < UNDER_WAY and self._order.left_over(message):
+        if message and self._clock() - self._began < UNDER_WAY and self._order.left_over(message):
             self.refuse(f'{message}: got a stamp from before the clock went back, expected a later one; '
                         'it belongs to the former session')
             return
@@ -103,7 +103,7 @@ class CalibrationSession:
 
     def keep(self, kind: str, octets: bytes) -> None:
         """Record a message, as no time is left to collect it."""
-        self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush=False)
+        self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, False)
 
     def flush(self) -> None:
         """Give the recorded messages to the operating system."""
@@ -190,8 +190,8 @@ class CalibrationSession:
 
     def clock_went_back(self, before: int, now: int) -> None:
         """Begin another session, as the node's clock went from one time [ns] back to another."""
+        self._graph.hear_waiting()
         if self._clock() - self._began > UNDER_WAY:  # else the stamps of messages told it first
-            self._graph.hear_waiting()
             self._begin_anew(went_back(before, now))
 
     def _begin_anew(self, why: str) -> None:
@@ -202,7 +202,7 @@ class CalibrationSession:
             self._graph.warn(why)
             return
         count, folder = self._collector.count, self._recorder.folder
-        place = 'forgotten' if folder is None else f'in {folder}'
+        place = f'in {folder}' if folder else 'forgotten'
         self._forget()
         self.refuse(f'{why}: a new session begins; the {count} trial(s) of the former one are {place}')
 
@@ -300,9 +300,8 @@ class CalibrationSession:
             return
         memory, options = self._memory, calibration.options
         memory.state, memory.detail = 'done', event.stop_reason
-        if memory is calibration.memory:
-            memory.result = event
-        else:
+        calibration.memory.result = event
+        if memory is not calibration.memory:
             memory.detail += '; this is the result of the session before the clock went back'
         found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
                           f'{measured(one.physical_value, one.physical_unit)}'

@@ -20,8 +20,8 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from result_message import result_values
-from serial import serial
 from rosgraph_msgs.msg import Clock
+from serial import serial
 from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
