@@ -156,7 +156,7 @@ def test_without_workers_it_says_so_and_waits(scheduler):
 def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(scheduler, start_worker, tmp_path):
     (tmp_path / 'toy_simulator.py').touch()
     for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
-                        (tmp_path, "another version .*'ToySimulator'.* the same version everywhere")):
+                        (tmp_path, "another version .*'ToySimulat.* the same version everywhere")):
         worker = start_worker(PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
         with pytest.raises(InputError, match=words):
             calibrate(toy_trials(1), options(scheduler), make_simulator=new_toy)
