@@ -42,6 +42,7 @@ setup(
     install_requires=[
         'Jinja2>=3.1',
         'lxml>=5.2',
+        'lz4>=4.0',
         'matplotlib>=3.6',
         'mcap>=1.6',
         'numba>=0.58',
@@ -51,6 +52,7 @@ setup(
         'rosbags>=0.11',
         'ruamel.yaml>=0.17',
         'scipy>=1.11',
+        'zstandard>=0.22',
     ],
     extras_require={
         'bench': [

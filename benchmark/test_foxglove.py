@@ -14,10 +14,11 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
 from dlo_calibration.files.bag import encode
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES, status
+from dlo_calibration.ros.diagnostics import status
 
 SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
 HERE = Path(__file__).parent / 'foxglove'

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from typing import Sequence
 
+DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
 LONGEST = 300  # characters of an error's text: a few lines of a terminal, whatever came
 
 #: Control characters (C0, DEL, C1), separators of lines, bidirectional overrides, and halves of surrogates.

@@ -24,10 +24,12 @@ EXECUTABLES = ('calibrator', 'dlo-calibration')
 
 #: Import name of a Python library -> its rosdep key, where that is not python3-<name>.
 ROSDEP_KEYS = {
+    'lz4': 'mcap-ros2-support',  # by way of mcap, which needs it
     'mcap': 'mcap-ros2-support',
     'pybullet': 'python3-pybullet-pip',
     'rosbags': 'python3-rosbags-pip',
     'ruamel': 'python3-ruamel.yaml',
+    'zstandard': 'mcap-ros2-support',
 }
 
 #: Imported only by what a user chooses, with words that tell what to install where it is missing.

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from typing import Any
 
 from dlo_calibration.calibration.engines import SimulatorFactory
@@ -33,12 +32,10 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 def _about(source: Source) -> dict[str, Any]:
     """Return what a session contains, as plain values."""
-    records = source.session.records
-    frames = sorted({message.header.frame_id for _, message in source.session.messages})
-    duration = (records[-1].log_time - records[0].log_time) / 1e9 if records else 0.0
     return {
-        'session': str(source.path), 'duration_s': duration, 'frames': frames,
-        'messages': dict(sorted(Counter(record.topic for record in records).items())),
+        'session': str(source.path), 'duration_s': source.session.duration,
+        'frames': list(source.session.frames),
+        'messages': dict(sorted(source.session.counts.items())),
         'options': source.session.recorded,
         'trials': [_about_trial(trial) for trial in source.trials],
         'refusals': list(source.refusals), 'problems': list(source.session.problems)}

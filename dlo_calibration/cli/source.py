@@ -15,7 +15,7 @@ from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.request import read_request, request_trials
-from dlo_calibration.files.session import read_session, Session, session_trials
+from dlo_calibration.files.session import Messages, read_session, Session, session_trials
 from dlo_calibration.model.trial import Trial
 
 
@@ -93,7 +93,7 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
     path = chosen.session if path is None else path
     request = read_request(path) if is_request(path) else None
     session = read_session(path, chosen.namespace) if request is None else \
-        Session(path, (), (), dict(request.options), request.problems, request.refusal)
+        Session(path, Messages(), (), dict(request.options), request.problems, request.refusal)
     recorded, problems, refusal = session.recorded or {}, session.problems, session.refusal
     if of_result:
         observed = {name: value for name, value in recorded.items() if name in names_of(OBSERVATION)}

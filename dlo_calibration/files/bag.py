@@ -5,45 +5,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import islice
 import json
 from pathlib import Path, PurePath
-from typing import Any, BinaryIO, Iterable, Iterator, Mapping
+import tempfile
+from typing import Any, Iterable, Iterator, Mapping
 
-from mcap.exceptions import EndOfFile
-from mcap.records import Channel, DataEnd, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from ruamel.yaml import YAML
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    Event,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceStartEvent,
+    StreamStartEvent,
+)
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, OUR_RECORD, typestore
+from dlo_calibration.files.intake import Intake, LimitExceeded, Record, require_file
+from dlo_calibration.files.mcap_file import McapFile
+from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, typestore
+from dlo_calibration.files.sqlite_file import read_sqlite
+from dlo_calibration.files.unpacking import unpack_file
 from dlo_calibration.messages.codec import INPUT_TYPES
 
-
-@dataclass(frozen=True)
-class Record:
-    """
-    One recorded message.
-
-    :param type: full name, ``package/msg/Type``.
-    :param data: CDR bytes, with the encapsulation header.
-    :param log_time: time of the recording [ns].
-    """
-
-    topic: str
-    type: str
-    data: bytes
-    log_time: int
-
-    @property
-    def name(self) -> str:
-        """The last component of the topic's name."""
-        return self.topic.rsplit('/', 1)[-1]
-
-    @property
-    def namespace(self) -> str:
-        """The topic's name without its last component."""
-        return self.topic.rpartition('/')[0]
+SUFFIXES = ('.mcap', '.db3', '.zstd')  # of recordings in a folder
+EXPECTED = 'an MCAP file or a rosbag2 folder'
+METADATA_SIZE = 10**6  # bytes; a recording of a hundred topics in a thousand files has a third
+METADATA_EVENTS = 50_000  # of the YAML parser: three seconds
+METADATA_DEPTH = 20  # rosbag2 needs 6
+OPTIONS_SIZE = 10**5  # characters of recorded options; ours have 2000
 
 
 def decode(record: Record) -> Any:
@@ -66,30 +58,25 @@ def encode(message: Any, message_type: str) -> bytes:
     return bytes(typestore().serialize_cdr(message, message_type))
 
 
-class _WholeReads:
-    """A stream that raises an error instead of returning fewer bytes than requested."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-
-    def read(self, length: int) -> bytes:
-        """Return exactly `length` bytes, or raise EndOfFile."""
-        piece = self._stream.read(length)
-        if len(piece) < length:
-            raise EndOfFile
-        return piece
-
-
 class Bag:
     """The parts of a recording that were read so far, from one or more files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.records: list[Record] = []
-        self.options: dict[str, Any] | None = None
-        self.problems: list[str] = []
-        self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
+        self.intake = Intake()
         self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
+        self._options: str | None = None  # the last recorded ones
+        self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
+
+    @property
+    def records(self) -> list[Record]:
+        """The messages that are kept, as they came."""
+        return self.intake.records
+
+    @property
+    def problems(self) -> list[str]:
+        """One text for each defect."""
+        return self.intake.problems
 
     def unusable(self, came: str, expected: str, remedy: str) -> InputError:
         """Return the error for a source that cannot be read at all."""
@@ -118,125 +105,164 @@ class Bag:
                    default=len(self.records))
         return [record for record in inputs if first <= places[id(record)] < last]
 
-    def read_folder(self) -> None:
+    def read(self) -> None:
+        """
+        Read the file or the folder.
+
+        :raises InputError: where nothing in it can be read.
+        """
+        try:
+            if self.path.is_dir():
+                self._read_folder()
+            else:
+                require_file(self.path, f'session {self.path}', EXPECTED)
+                self._read_file(self.path)
+        except OSError as error:
+            raise self.unusable(str(error), 'a file or a folder that can be read',
+                                'check the path and its permissions') from error
+
+    def _read_folder(self) -> None:
         """Read all files of a rosbag2 folder."""
-        about = self._about_folder()
-        names = [PurePath(str(name)).name for name in about.get('relative_file_paths') or []]
-        files = [self.path / name for name in names] or sorted(
-            file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
+        files = self._files()
         if not files:
             raise self.unusable('a folder without a recording', 'a rosbag2 folder, or an MCAP file',
                                 'name the folder that holds the metadata.yaml')
-        if about.get('compression_mode') not in (None, '', 'NONE', 'none'):
-            self.read_rosbags(self.path)
-            return
+        found = []
         for file in files:
-            if not file.exists():
-                self.problems.append(f'{file.name} is missing, though metadata.yaml names it')
-            elif file.suffix == '.db3':
-                self.read_rosbags(file)
+            why = _unreadable(file)
+            if why:
+                self.problems.append(f'{file.name}: {why}')
             else:
-                self.read_mcap(file)
-        if not any(file.exists() for file in files):
-            raise self.unusable('none of the files that metadata.yaml names', 'the whole rosbag2 folder',
-                                'copy the recording with all of its files')
+                found.append(file)
+        if not found:
+            raise self.unusable(f'no recording that can be read ({self.problems[-1]})',
+                                'the whole rosbag2 folder', 'copy the recording with all of its files')
+        refusals = []
+        for file in found:
+            try:
+                self._read_file(file)
+            except InputError as error:
+                refusals.append(error)
+        if len(refusals) == len(found):
+            raise refusals[0]
+        self.problems.extend(str(error) for error in refusals)
 
-    def _about_folder(self) -> Mapping[str, Any]:
-        """Return the content of metadata.yaml; empty where the file is missing or damaged."""
+    def _files(self) -> list[Path]:
+        """Return the recordings of a folder that metadata.yaml names; all where it cannot be read."""
         file = self.path / METADATA_FILE
-        if not file.exists():
-            self.problems.append(f'{METADATA_FILE} is missing')
-            return {}
+        names: list[str] = []
         try:
-            about = YAML(typ='safe', pure=True).load(file.read_text(encoding='utf-8'))[METADATA_KEY]
-            if isinstance(about, dict) and isinstance(about.get('relative_file_paths') or [], list):
-                return about
+            why = _unreadable(file)
+            if why:
+                self.problems.append(f'{METADATA_FILE}: {why}')
+            else:
+                names = _recordings(file)
         except OSError:
             raise
         except Exception:  # damaged YAML can raise anything
-            pass
-        self.problems.append(f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
-        return {}
+            self.problems.append(
+                f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
+        return [self.path / name for name in dict.fromkeys(names)] or sorted(
+            one for one in self.path.iterdir() if one.suffix in SUFFIXES)
 
-    def read_rosbags(self, path: Path) -> None:
-        """Read a SQLite file or a compressed folder with the library rosbags."""
-        from rosbags.rosbag2 import Reader  # loads compression libraries that MCAP does not need
-
-        before = len(self.records)
+    def _read_file(self, file: Path) -> None:
+        """Read one recording; a defect is noted, or raised where nothing was read."""
+        before = len(self.records), sum(self.intake.counts.values())
         try:
-            with Reader(path) as reader:
-                for connection, log_time, data in reader.messages():
-                    self.records.append(Record(connection.topic, connection.msgtype, bytes(data), log_time))
-        except Exception as error:  # damaged files can raise anything
-            self._note_early_end(path, before, error)
-
-    def read_mcap(self, path: Path) -> None:
-        """Read an MCAP file to its end, or to the first damaged place."""
-        before = len(self.records)
-        with path.open('rb') as stream:
-            try:
-                for entry in _mcap_entries(stream, path.stat().st_size):
-                    if isinstance(entry, Record):
-                        self.records.append(entry)
-                    elif isinstance(entry, str):
-                        self.problems.append(entry)
-                    else:
-                        self._read_metadata(entry)
-            except Exception as error:  # damaged files can raise anything
-                self._note_early_end(path, before, error)
-
-    def _read_metadata(self, entries: Mapping[str, str]) -> None:
-        if 'options' in entries:
-            try:
-                options = json.loads(entries['options'])
-            except ValueError:
-                options = None
-            if isinstance(options, dict):
-                self.options = options
+            if file.suffix == '.zstd':
+                self._read_packed(file)
             else:
-                self.problems.append('recorded options that cannot be read are left out')
+                self._read_unpacked(file, file.name)
+            return
+        except (OSError, InputError):
+            raise
+        except LimitExceeded as error:
+            text = f'{file.name} is not read to its end: {error}; the ' \
+                   f'{len(self.records) - before[0]} message(s) before that are used; split the recording'
+        except Exception as error:  # damaged files can raise anything
+            text = ' '.join(f'{type(error).__name__}: {error}'.split())
+            text = f'{file.name} is cut or damaged ({text}); ' \
+                   f'the {len(self.records) - before[0]} message(s) before that were read'
+        if sum(self.intake.counts.values()) == before[1]:
+            raise self.unusable(f'a file without a readable message ({text.partition(";")[0]})', EXPECTED,
+                                'record it again')
+        self.problems.append(text)
+
+    def _read_packed(self, file: Path) -> None:
+        """Read a recording that rosbag2 compressed as a whole."""
+        self.intake.open(file.stat().st_size)
+        with tempfile.TemporaryDirectory(prefix='dlo_calibration_') as folder:
+            target = Path(folder) / f'recording{file.with_suffix("").suffix}'
+            unpack_file(file, target, self.intake.unpack)
+            self._read_unpacked(target, file.name)
+
+    def _read_unpacked(self, file: Path, name: str) -> None:
+        if file.suffix == '.db3':
+            read_sqlite(file, name, self.intake)
+            return
+        with file.open('rb') as stream:
+            McapFile(stream, file.stat().st_size, name, self.intake, self._take_entries).read()
+
+    def _take_entries(self, entries: Mapping[str, str]) -> None:
+        """Take the entries of one of our own metadata records."""
+        self._options = entries.get('options', self._options)
         if 'mark' in entries:
             self.marks.append((entries['mark'], len(self.records)))
         if 'dropped' in entries:
             self._dropped = entries['dropped']
 
-    def _note_early_end(self, path: Path, before: int, error: Exception) -> None:
-        """Note an early end of reading; raise an error where nothing was read."""
-        why = 'the file ends too early' if isinstance(error, EndOfFile) else \
-            ' '.join(f'{type(error).__name__}: {error}'.split())
-        if len(self.records) == before:
-            raise self.unusable(f'a file without a readable message ({why})',
-                                'an MCAP file or a rosbag2 folder', 'record it again') from error
-        self.problems.append(f'{path.name} is cut or damaged ({why}); '
-                             f'the {len(self.records) - before} message(s) before that were read')
+    def options(self) -> dict[str, Any] | None:
+        """Return the last recorded options, as they stand there; None: none were recorded."""
+        if self._options is None:
+            return None
+        try:
+            found = json.loads(self._options[:OPTIONS_SIZE])
+            if isinstance(found, dict):
+                return found
+        except (ValueError, RecursionError):
+            pass
+        self.problems.append('recorded options that cannot be read are left out')
+        return None
 
 
-def _mcap_entries(stream: BinaryIO, size: int) -> Iterator[Record | Mapping[str, str] | str]:
-    """Yield the messages, our own metadata records, and a text for each thing that is left out."""
-    reader = StreamReader(_WholeReads(stream), validate_crcs=True, record_size_limit=size)  # type: ignore
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    for record in reader.records:
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            if record.id not in channels and record.message_encoding != 'cdr':
-                yield (f'topic {record.topic} is left out: its messages are '
-                       f'{record.message_encoding!r}, not cdr')
-            channels[record.id] = record
-        elif isinstance(record, Message):
-            channel = channels[record.channel_id]
-            if channel.message_encoding == 'cdr':
-                schema = schemas.get(channel.schema_id)
-                yield Record(channel.topic, _full_name(schema.name if schema else ''),
-                             record.data, record.log_time)
-        elif isinstance(record, Metadata) and record.name == OUR_RECORD:
-            yield record.metadata
-        elif isinstance(record, DataEnd):
-            return
+def _unreadable(file: Path) -> str:
+    """Return why a file of a folder is not to be read, if there is a reason."""
+    if file.is_symlink() and file.resolve().parent != file.parent.resolve():
+        return 'it is left out, as it is a link out of the folder; name the file it leads to'
+    if not file.exists():
+        return 'it is missing' + ('' if file.name == METADATA_FILE else f', though {METADATA_FILE} names it')
+    return '' if file.is_file() else 'it is left out, as it is no regular file'
 
 
-def _full_name(name: str) -> str:
-    """Return ``package/msg/Type``, also for the short form ``package/Type`` of some writers."""
-    package, slash, kind = name.partition('/')
-    return f'{package}/msg/{kind}' if slash and '/' not in kind else name
+def _recordings(file: Path) -> list[str]:
+    """Return the names of the recordings in a metadata.yaml; its damages can raise anything."""
+    with file.open('rb') as stream:
+        octets = stream.read(METADATA_SIZE + 1)
+    if len(octets) > METADATA_SIZE:
+        raise ValueError('too large')
+    if b'\0' in octets:
+        raise ValueError('no text')
+    events = islice(YAML(typ='safe', pure=True).parse(octets.decode('utf-8')), METADATA_EVENTS)
+    whole = _plain(event for event in events if not isinstance(event, (StreamStartEvent, DocumentStartEvent)))
+    names = whole[METADATA_KEY].get('relative_file_paths') or []
+    if not isinstance(names, list):
+        raise ValueError('no list of files')
+    return [PurePath(name).name for name in names]
+
+
+def _plain(events: Iterator[Event], depth: int = 0) -> Any:
+    """
+    Return the value that comes next: text, a list or a dict; None for the end of a list or a dict.
+
+    :raises Exception: of any kind, where the events end, and for aliases, as a few make millions of values.
+    """
+    event = next(events)
+    if isinstance(event, AliasEvent) or depth > METADATA_DEPTH:
+        raise ValueError('an alias, or values nested too deep')
+    if isinstance(event, ScalarEvent):
+        return event.value
+    if isinstance(event, SequenceStartEvent):
+        return list(iter(lambda: _plain(events, depth + 1), None))
+    if isinstance(event, MappingStartEvent):
+        return {key: _plain(events, depth + 1) for key in iter(lambda: _plain(events, depth + 1), None)}
+    return None

@@ -10,17 +10,19 @@ other bags that contain the topics of the calibrator.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Iterable
+from typing import Any, Iterable, Mapping, overload, Sequence
 
 import numpy as np
 
 from dlo_calibration.calibration.file_options import file_options, FileOptions
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import InputError, told
-from dlo_calibration.files.bag import Bag, decode, encode, Record
+from dlo_calibration.errors import DEFECT, InputError, told
+from dlo_calibration.files.bag import Bag, decode, encode
+from dlo_calibration.files.intake import Record
 from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
@@ -38,6 +40,32 @@ from dlo_calibration.messages.trial_builder import order as order_of
 from dlo_calibration.model.trial import Trial
 
 
+class Messages(Sequence[tuple[str, Any]]):
+    """
+    The (kind, message) pairs of records that decode; each is decoded anew where it is used.
+
+    A decoded message takes several times the memory of its bytes.
+    """
+
+    def __init__(self, records: Sequence[Record] = ()) -> None:
+        self._records = tuple(records)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[str, Any]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Messages: ...
+
+    def __getitem__(self, index: int | slice) -> tuple[str, Any] | Messages:
+        if isinstance(index, slice):
+            return Messages(self._records[index])
+        record = self._records[index]
+        return record.name, decode(record)
+
+
 @dataclass(frozen=True)
 class Session:
     """
@@ -46,18 +74,24 @@ class Session:
     :param messages: (kind, message) pairs of the input topics in log order: those that
         the last calibration of the session used, or, where none was started, all since
         the last reset.
-    :param records: all recorded messages, also outputs, in log order.
+    :param records: all recorded messages of the calibrator's topics, also outputs, in log order.
     :param recorded: the last recorded options, by name, as far as a file may set them; None: there were none.
     :param problems: one text for each defect that did not prevent reading.
     :param refusal: why the recorded scene is not among the options.
+    :param counts: number of recorded messages by topic, also of those that other programs use.
+    :param duration: time from the first to the last of these [s].
+    :param frames: the frame_ids of `messages`, sorted.
     """
 
     path: Path
-    messages: tuple[tuple[str, Any], ...]
+    messages: Messages
     records: tuple[Record, ...]
     recorded: dict[str, Any] | None = None
     problems: tuple[str, ...] = ()
     refusal: InputError | None = None
+    counts: Mapping[str, int] = field(default_factory=dict)
+    duration: float = 0.0
+    frames: tuple[str, ...] = ()
 
     @property
     def options(self) -> Options:
@@ -104,6 +138,9 @@ def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...
         except InputError as error:
             refusals.append(str(error))
             continue
+        except Exception as error:  # a defect of this package must not cost the other messages
+            refusals.append(f'{kind}: could not be used ({error!r}); {DEFECT}')
+            continue
         if order.clock_went_back(one):
             refusals.append(f'{went_back(order.newest, one.stamp)}: '
                             'what comes after it makes trials of its own')
@@ -137,6 +174,8 @@ def _collected(messages: Iterable[Message], options: Options) -> tuple[tuple[Tri
             collector.add(one)
         except InputError as error:
             refusals.append(str(error))
+        except Exception as error:  # a defect of this package must not cost the other messages
+            refusals.append(f'{one}: could not be used ({error!r}); {DEFECT}')
         refusals += [str(refusal) for refusal in collector.take_news()]
     refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
     return collector.trials, refusals
@@ -160,44 +199,52 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
     """
     path = Path(path)
     source = Bag(path)
-    try:
-        if path.is_dir():
-            source.read_folder()
-        elif path.suffix == '.db3':
-            source.read_rosbags(path)
-        else:
-            source.read_mcap(path)
-    except OSError as error:
-        raise source.unusable(str(error), 'a file or a folder that can be read',
-                              'check the path and its permissions') from error
+    source.read()
     records = tuple(sorted(source.records, key=lambda record: record.log_time))
-    problems = source.problems
-    topics = _input_topics(path, records, namespace, problems)
+    recorded, problems = source.options(), source.problems
+    topics = _input_topics(path, sorted(source.intake.counts), namespace, problems)
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
     used = source.used(inputs)
-    messages = []
-    for record in used:
-        try:
-            messages.append((record.name, decode(record)))
-        except InputError as error:
-            problems.append(str(error))
+    messages, frames = _checked(used, problems)
     problems += source.dropped()
     late = len(inputs) - len(used)
     if late:
         problems.append(f'{late} message(s) before the last reset or after the last start are left out, '
                         'as the live calibration did not use them')
-    recorded = file_options(source.options or {}, path if path.is_dir() else path.parent)
-    return Session(path, tuple(messages), records, None if source.options is None else dict(recorded.values),
-                   counted(map(told, [*problems, *recorded.problems])), recorded.refusal)
+    counts: Counter[str] = Counter()
+    for (topic, _), count in source.intake.counts.items():
+        counts[topic] += count
+    allowed = file_options(recorded or {}, path if path.is_dir() else path.parent)
+    return Session(path, messages, records, None if recorded is None else dict(allowed.values),
+                   counted(map(told, [*problems, *allowed.problems])), allowed.refusal, counts,
+                   source.intake.duration, frames)
 
 
-def _input_topics(path: Path, records: Iterable[Record], namespace: str | None,
+def _checked(records: Iterable[Record], problems: list[str]) -> tuple[Messages, tuple[str, ...]]:
+    """Return the messages that decode, and their frame_ids; tell of the others, once for each topic."""
+    good, frames = [], set()
+    bad: dict[str, InputError] = {}
+    more: Counter[str] = Counter()
+    for record in records:
+        try:
+            frame = decode(record).header.frame_id
+        except InputError as error:
+            more[record.topic] += record.topic in bad
+            bad.setdefault(record.topic, error)
+            continue
+        good.append(record)
+        frames.add(frame)
+    problems += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
+                 for topic, error in bad.items()]
+    return Messages(good), tuple(sorted(frames))
+
+
+def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | None,
                   problems: list[str]) -> frozenset[str]:
-    """Return the names of the topics to read, at most one for each kind of message."""
-    seen = {(record.topic, record.type): record for record in records}
+    """Return the topics to read, at most one for each kind of message; `seen` has topics and their types."""
     found: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES}
-    for record in seen.values():
+    for record in (Record(topic, kind, b'', 0) for topic, kind in seen):
         if record.type == INPUT_TYPES.get(record.name):
             if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
                 found[record.name].append(record)
@@ -207,7 +254,7 @@ def _input_topics(path: Path, records: Iterable[Record], namespace: str | None,
     if not any(found.values()):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
-            f'session {path}', held,
+            f'session {path}', f'{held} ({problems[-1]})' if problems else held,
             'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in INPUT_TYPES.items())
             + ('' if namespace is None else f' in namespace {namespace}'),
             'record the topics of the calibrator' if namespace is None else 'correct the namespace')

@@ -27,12 +27,13 @@ import numpy as np
 from dlo_calibration.calibration.file_options import file_options, FileOptions, recordable
 from dlo_calibration.calibration.options import Declaration, declarations, Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.intake import require_file
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import exact
 from dlo_calibration.writing import whole
 
-MAXIMUM_SIZE = 64 * 2**20  # bytes; far above any real request, and small enough for the memory
-MAXIMUM_ELEMENTS = 1_000_000  # likewise
+MAXIMUM_SIZE = 32 * 2**20  # bytes; far above any real request, and small enough for the memory
+MAXIMUM_ELEMENTS = 500_000  # likewise
 MAXIMUM_DEPTH = 16  # the schemas need less than half
 
 #: First two characters of a pattern in the schemas -> its meaning.
@@ -47,6 +48,7 @@ def read_octets(path: str | Path, what: str, suggestion: str) -> bytes:
     """
     where = f'{what} {path}'
     try:
+        require_file(Path(path), where, suggestion)
         with Path(path).open('rb') as stream:
             octets = stream.read(MAXIMUM_SIZE + 1)
     except (OSError, ValueError) as error:

@@ -182,7 +182,6 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
     if count and step > len(cloud.data):
         raise InputError(thing, f'{len(cloud.data)} bytes of data', f'{count} points of {step} bytes',
                          'send all points, or correct point_step')
-    dtype = _point_type(thing, cloud, step)
     stride = step
     if height > 1:
         stride = int(cloud.row_step)
@@ -194,19 +193,26 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
         raise InputError(thing, f'{len(cloud.data)} bytes of data',
                          f'{needed} for {count} points of {step} bytes',
                          'send all points, or correct width, height and point_step')
-    octets = np.frombuffer(cloud.data, np.uint8) if count else np.zeros(0, np.uint8)
-    table = np.ndarray((count,), dtype, octets, strides=(stride,))
-    hands = table['hand'] if 'hand' in dtype.fields else None  # type: ignore[operator]
-    features = table['feature'] != 0 if 'feature' in dtype.fields else None  # type: ignore[operator]
+    if not count:
+        return ChainMessage(kind, stamp, cloud.header.frame_id, _chain(thing, np.zeros((0, 3))))
+    table = np.ndarray((count,), _point_type(thing, cloud, step), np.frombuffer(cloud.data, np.uint8),
+                       strides=(stride,))
+    given = table.dtype.names or ()
+    hands = table['hand'] if 'hand' in given else None
+    features = table['feature'] != 0 if 'feature' in given else None
     if hands is not None and (hands > MAXIMUM_HANDS).any():
         raise InputError(thing, f'hand {hands.max()}', f'0 for none, or 1 to {MAXIMUM_HANDS}',
                          'number the hands as in joint_names of the action')
     points = np.stack([table[name].astype(float) for name in COORDINATES], axis=1)
+    return ChainMessage(kind, stamp, cloud.header.frame_id, _chain(thing, points, hands, features))
+
+
+def _chain(thing: str, points: Floats, hands: Any = None, features: Any = None) -> Chain:
+    """Return a chain; a refusal names the message."""
     try:
-        chain = Chain(points, hands, features)  # type: ignore[arg-type]
+        return Chain(points, hands, features)
     except InputError as error:
         raise InputError(thing, error.came, error.expected, error.remedy) from error
-    return ChainMessage(kind, stamp, cloud.header.frame_id, chain)
 
 
 def _point_type(thing: str, cloud: Any, step: int) -> np.dtype[Any]:

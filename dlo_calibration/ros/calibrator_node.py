@@ -30,14 +30,14 @@ from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.errors import InputError, printable
+from dlo_calibration.errors import DEFECT, InputError, printable
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.messages.stamp_order import MARGIN
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.inbox import Inbox
 from dlo_calibration.ros.memory import Pace
 from dlo_calibration.ros.parameters import OptionsNode
-from dlo_calibration.ros.session import CalibrationSession, DEFECT
+from dlo_calibration.ros.session import CalibrationSession
 
 LOG = logging.getLogger('dlo_calibration')  # where the rest of the package logs its notices
 ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole

@@ -17,13 +17,6 @@ from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.quantity import exact, interval, measured, number
 from dlo_calibration.report import sentences
 
-OUTPUT_TYPES: Mapping[str, str] = {
-    'progress': 'diagnostic_msgs/msg/DiagnosticArray',
-    'result': 'diagnostic_msgs/msg/DiagnosticArray',
-    'dlo_description': 'std_msgs/msg/String',
-    'status': 'diagnostic_msgs/msg/DiagnosticArray',
-    'markers': 'visualization_msgs/msg/MarkerArray',
-}
 STATES = ('collecting', 'calibrating', 'done', 'failed')
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 WHOLE = 'calibration'  # name of the status about the whole result; the others have a parameter's name

@@ -10,6 +10,7 @@ from typing import Any, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
@@ -17,7 +18,6 @@ from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.drawing import hand_path
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 # Types and actions of visualization_msgs/Marker.
 CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9

@@ -19,8 +19,9 @@ from dlo_calibration.calibration.live_information import LiveInformation
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
-from dlo_calibration.errors import DloCalibrationError, InputError, told
+from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import description_document
 from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import TrialCollector
@@ -28,7 +29,6 @@ from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 from dlo_calibration.ros.graph import Graph
 from dlo_calibration.ros.markers import markers
 from dlo_calibration.ros.memory import Calibration, Memory, Pace
@@ -38,7 +38,6 @@ QUIET = 0.5  # s without action or goal chain, after which the last trial counts
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
 OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
-DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
 
 
 class CalibrationSession:

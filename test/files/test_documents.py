@@ -10,7 +10,7 @@ import re
 import pytest
 
 from dlo_calibration.calibration.options import declarations
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
+from dlo_calibration.files.intake import OUTPUT_TYPES
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -17,9 +17,9 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH_FILE = ROOT / 'launch' / 'calibrator.launch.py'

@@ -28,11 +28,11 @@ from toy_simulator import Deadly, ToySimulator
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.cli import main as cli
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.ros.calibrator_node import CalibratorNode, spin
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
 
 pytestmark = pytest.mark.usefixtures('without_drawings')
 

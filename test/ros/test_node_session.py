@@ -3,7 +3,6 @@
 
 """What the node knows and decides, without a graph."""
 
-from collections import defaultdict
 import errno
 import os
 from pathlib import Path
@@ -11,94 +10,21 @@ import time
 
 import pytest
 from result_message import result_values
+from toy_graph import ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
 from wrong_input import with_point
 
 from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.files import recording
 from dlo_calibration.files.bag import encode
-from dlo_calibration.files.recording import typestore
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import bag_types, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.quantity import number
-from dlo_calibration.ros.diagnostics import OUTPUT_TYPES
-from dlo_calibration.ros.session import CalibrationSession
 
 pytestmark = pytest.mark.usefixtures('without_drawings')
-
-PATIENCE = 60.0  # s
-TYPES = bag_types()
-
-
-def values(status):
-    return {pair.key: pair.value for pair in status.values}
-
-
-def whole(result):
-    return values(next(one for one in result.status if one.name == 'calibration'))
-
-
-class ToyGraph:
-    """A graph in which whatever is published is heard at once; `ahead` [s] lets time pass."""
-
-    def __init__(self, folder, make, **options):
-        self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
-        self.ahead = 0.0
-        self.heard, self.logged, self.waiting = defaultdict(list), defaultdict(list), []
-        self.info, self.warn, self.error = (self.logged[level].append for level in ('info', 'warn', 'error'))
-        self.session = CalibrationSession(self, TYPES, make, lambda: time.monotonic() + self.ahead)
-
-    def options(self):
-        return Options.of({**Options().flat(), **self.set})
-
-    def stamp(self):
-        return MINUTE
-
-    def topic(self, name):
-        return f'/calibrator/{name}'
-
-    def decode(self, kind, octets):
-        return typestore().deserialize_cdr(octets, INPUT_TYPES[kind])
-
-    def encode(self, name, message):
-        return encode(message, OUTPUT_TYPES[name])
-
-    def publish(self, name, octets):
-        self.heard[name].append(typestore().deserialize_cdr(octets, OUTPUT_TYPES[name]))
-
-    def hear_waiting(self):
-        pairs, self.waiting = self.waiting, []
-        self.send(pairs)
-
-    def send(self, pairs):
-        for kind, message in pairs:
-            self.session.hear(kind, encode(message, INPUT_TYPES[kind]))
-        self.session.tick()
-
-    def until(self, condition):
-        begun = time.monotonic()
-        while not condition():
-            assert time.monotonic() - begun < PATIENCE, self.status
-            self.session.tick()
-            time.sleep(0.002)
-
-    @property
-    def status(self):
-        return values(self.heard['status'][-1].status[0])
-
-    def calibrated(self):
-        """Start, and return the result."""
-        before = len(self.heard['result'])
-        done, answer = self.session.request('start')
-        assert done, answer
-        self.until(lambda: self.status['state'] != 'calibrating')
-        assert self.status['state'] == 'done', self.status
-        assert len(self.heard['result']) == before + 1
-        return self.heard['result'][-1]
-
 
 @pytest.fixture
 def start(tmp_path):

@@ -20,11 +20,13 @@ import tempfile
 import time
 
 FOLDER = Path(__file__).resolve().parent
-sys.path += [str(FOLDER.parent / 'support'), str(FOLDER)]
+sys.path += [str(FOLDER.parent / 'support'), str(FOLDER), str(FOLDER.parent)]
 
 CAMPAIGNS: tuple[str, ...] = (
+    'bombs',
     'disk',
     'flood',
+    'fuzz',
     'interrupt',
     'kill',
     'scenes',

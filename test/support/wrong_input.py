@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import functools
+import random
 from typing import Any, Callable
 
 from hypothesis import strategies as st
@@ -308,29 +309,41 @@ def fuzzed_pairs(types: MessageTypes, frame: str) -> list:
             (ACTION, two(types)), (GOAL, cloud(LATE + 9 * SECOND, frame)(types))]
 
 
-@st.composite
-def mutated_bytes(draw, octets: bytes) -> bytes:
-    """Mutate a serialised message: overwrite, cut, lengthen, repeat."""
+def mutated(octets: bytes, dice: random.Random) -> bytes:
+    """Mutate a serialised message or a file: overwrite, cut, lengthen, repeat, swap."""
     found = bytearray(octets)
-    for _ in range(draw(st.integers(1, 3))):
+    for _ in range(dice.randint(1, 3)):
         if len(found) < 9:
             break
-        place = draw(st.integers(0, len(found) - 8))
-        how = draw(st.sampled_from(('byte', 'integer', 'number', 'cut', 'insert', 'remove')))
-        if how == 'byte':
-            found[place] = draw(st.integers(0, 255))
+        place = dice.randint(0, len(found) - 8)
+        how = dice.choice(('bit', 'byte', 'integer', 'number', 'cut', 'insert', 'remove', 'repeat', 'swap'))
+        if how == 'bit':
+            found[place] ^= 1 << dice.randint(0, 7)
+        elif how == 'byte':
+            found[place] = dice.randint(0, 255)
         elif how == 'integer':
-            value = draw(st.sampled_from(INTEGERS)) % 2**32
+            value = dice.choice(INTEGERS) % 2**32
             found[place // 4 * 4:place // 4 * 4 + 4] = value.to_bytes(4, 'little')
         elif how == 'number':
-            found[place // 4 * 4:place // 4 * 4 + 8] = np.float64(draw(st.sampled_from(NUMBERS))).tobytes()
+            found[place // 4 * 4:place // 4 * 4 + 8] = np.float64(dice.choice(NUMBERS)).tobytes()
         elif how == 'cut':
             del found[place:]
         elif how == 'insert':
-            found[place:place] = draw(st.binary(min_size=1, max_size=8))
+            found[place:place] = bytes(dice.randint(0, 255) for _ in range(dice.randint(1, 8)))
+        elif how == 'remove':
+            del found[place:place + dice.randint(1, 8)]
         else:
-            del found[place:place + draw(st.integers(1, 8))]
+            piece = found[place:place + dice.choice((8, 100, 1000))]
+            other = dice.randint(0, len(found) - 1)
+            if how == 'swap':
+                found[place:place + len(piece)] = found[other:other + len(piece)]
+            found[other:other + (len(piece) if how == 'swap' else 0)] = piece
     return bytes(found)
+
+
+def mutated_bytes(octets: bytes) -> st.SearchStrategy[bytes]:
+    """Return a strategy of mutations of a serialised message."""
+    return st.randoms(use_true_random=False).map(functools.partial(mutated, octets))
 
 
 def _places(message: Any) -> list:
