@@ -9,7 +9,6 @@ from collections import Counter
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 import io
 import json
-import os
 from pathlib import Path
 import random
 import resource
@@ -35,7 +34,7 @@ from dlo_calibration.files.request import Request, TrialRequest, write_request
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 
-SHORT, FULL = 4, 1000  # rounds; a FULL one takes about half a second
+SHORT, FULL = 2, 200  # rounds, of about three seconds each
 MESSAGES = 50  # mutated ones a round for the reader
 FLOOD = 2000  # mutated ones for a node in another process, in the full form
 TYPES = bag_types()
@@ -269,5 +268,4 @@ def node(tally: Tally, dice: random.Random, folder: Path) -> None:
         robot.call('start')
         robot.until_result()
         tally.died += process.poll() is not None
-        _, _, usage = os.wait4(process.pid, os.WNOHANG)
-        tally.remember(peak=usage.ru_maxrss * 1024)
+    tally.remember(peak=resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
