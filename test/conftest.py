@@ -14,12 +14,17 @@ import sys
 
 from domain import ros_graph, WORKER
 from drawings import leave_out_drawings
+from hypothesis import settings
 import pytest
 from serial import serial
 from toy_simulator import ToySimulator
 from wire import SOURCES
 
 from dlo_calibration.cli import main as cli
+
+# No test is timed: an example takes long where other programs keep the machine busy.
+settings.register_profile('untimed', settings(), deadline=None)
+settings.load_profile('untimed')
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'dlo_calibration'

@@ -131,7 +131,7 @@ def values(declaration):
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.fixed_dictionaries({}, optional={name: values(d) for name, d in DECLARED.items()}))
 def test_flat_and_of_are_inverse(given_options):
     options = Options.of(given_options)

@@ -178,11 +178,16 @@ def test_the_journal_says_what_a_line_is_of(tmp_path):
         'rope', 'cma_es', 5, 2, 'toy')
 
 
-def test_a_journal_that_cannot_be_read_or_written_is_refused(tmp_path):
+def test_a_journal_that_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(InputError, match='--output'):
         Journal(tmp_path)
-    with pytest.raises(InputError, match='--output'):
-        Journal(tmp_path / 'nowhere' / 'x').add(task(), OUTCOME)
+
+
+def test_a_journal_that_cannot_be_written_says_so_and_still_knows_the_outcome(tmp_path):
+    journal = Journal(tmp_path / 'nowhere' / 'x')
+    journal.add(task(), OUTCOME)
+    assert journal.failure == 'No such file or directory'
+    assert journal.find(task()) == OUTCOME
 
 
 @pytest.mark.parametrize(('count', 'held_back', 'said'), [

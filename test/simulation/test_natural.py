@@ -80,7 +80,7 @@ def natural_energy(points, moments):
     return -np.sqrt(total @ total + (0.05 * moments.mean())**2)
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(derandomize=True, max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_forces_of_the_natural_curvature_are_the_slope_of_its_energy(seed, wild):
     generator = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def test_forces_of_the_natural_curvature_are_the_slope_of_its_energy(seed, wild)
     assert got == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(derandomize=True, max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 10.0), st.sampled_from([0.001, 0.004]))
 def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step):
     rest = np.random.default_rng(seed).uniform(0.02, 0.05, 15)
@@ -124,7 +124,7 @@ def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step):
     assert total() < start
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(derandomize=True, max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_a_coiled_rod_neither_flies_away_nor_begins_to_spin(seed):
     rest = np.random.default_rng(seed).uniform(0.02, 0.05, 12)

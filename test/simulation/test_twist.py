@@ -39,7 +39,7 @@ def begun(seed, count=9):
     return crumpled(seed + 1, rest, 0.15), spans
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(derandomize=True, max_examples=10)
 @given(st.integers(0, 2**31))
 def test_forces_are_the_slope_of_the_energy(seed):
     points, spans = begun(seed)
@@ -59,7 +59,7 @@ def test_forces_are_the_slope_of_the_energy(seed):
             assert got[index] == pytest.approx(expected, abs=1e-5 * np.abs(got).max())
 
 
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(derandomize=True, max_examples=20)
 @given(st.integers(0, 2**31))
 def test_the_compiled_forces_are_the_same(seed):
     points, spans = begun(seed)
