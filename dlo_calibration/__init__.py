@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from dlo_calibration.calibration.calibrate import calibrate
     from dlo_calibration.calibration.options import Options
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
+    from dlo_calibration.evaluation.log import EvaluationLog
     from dlo_calibration.files.result import read_result
     from dlo_calibration.files.session import read_session
     from dlo_calibration.model.action import Action, Hand
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from dlo_calibration.simulation.bullet import BulletRope
 
 __all__ = [
-    'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'Goal', 'Hand',
+    'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'EvaluationLog', 'Goal', 'Hand',
     'InputError', 'Options', 'SimulationError', 'Trial', 'calibrate', 'read_result', 'read_session',
 ]
 
@@ -34,6 +35,7 @@ _MODULES = {
     'model.trial': ('Goal', 'Trial'),
     'calibration.options': ('Options',),
     'calibration.calibrate': ('calibrate',),
+    'evaluation.log': ('EvaluationLog',),
     'files.session': ('read_session',),
     'files.result': ('read_result',),
     'simulation.bullet': ('BulletRope',),

@@ -15,6 +15,7 @@ from typing import Callable, Sequence
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.fit import Fit, fit
+from dlo_calibration.calibration.identity import engine_digest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.parts import fit_parts
 from dlo_calibration.calibration.prior import Prior, prior
@@ -25,6 +26,8 @@ from dlo_calibration.calibration.surroundings import examined
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.log import EvaluationLog
+from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import SEARCHES
@@ -35,6 +38,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
               on_notice: Callable[[str], None] = lambda _: None,
               should_stop: Callable[[], bool] = lambda: False,
               make_simulator: SimulatorFactory = make_chosen_simulator,
+              log: EvaluationLog | None = None,
               clock: Callable[[], float] = time.monotonic) -> CalibrationResult:
     """
     Find the parameter set whose simulation fits the trials best, and how certain each parameter is.
@@ -48,6 +52,9 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         the calibration, such as a process that died; `CalibrationResult.warnings` contains it, too.
     :param should_stop: asked often; once True, every stage ends, and the result is the best so far.
     :param make_simulator: makes the engine that `options` name; called in this thread.
+    :param log: each finished evaluation is written to it, and none in it is simulated again: after an
+        interruption, even by `kill -9`, the same call gives the same result, except for its `seconds`. None:
+        nothing is kept.
     :param clock: the time [s], for `CalibrationResult.seconds`.
     :raises InputError: if there is no trial, or an option cannot be satisfied.
     :raises SimulationError: if no evaluation could be simulated.
@@ -69,11 +76,12 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         simulator = stack.enter_context(closing(make_simulator(options)))
         if executor is not None:
             simulator.prepare()
-        setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation)
+        memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
+        setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
         result = fitted(setting)
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
-    result = confirmed(result, options, make_simulator, should_stop)
+    result = confirmed(result, options, make_simulator, should_stop, memory)
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     return replace(result, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
 

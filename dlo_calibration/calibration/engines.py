@@ -21,7 +21,7 @@ SimulatorFactory = Callable[[Options], Simulator]
 def _bullet(options: Options) -> Simulator:
     from dlo_calibration.simulation.bullet import BulletSimulator
 
-    simulator = BulletSimulator(**_settings(options), scene=options.scene)
+    simulator = BulletSimulator(**engine_settings(options), scene=options.scene)
     if not options.scene or parent_process() is not None:  # a worker's process is one of its own already
         return simulator
     # A scene may come from a stranger: what it does to PyBullet must not end the node or the command.
@@ -34,7 +34,7 @@ def _compiled(options: Options) -> Simulator:
                          'use engine bullet or auto')
     from dlo_calibration.simulation.compiled import CompiledSimulator
 
-    return CompiledSimulator(**_settings(options))
+    return CompiledSimulator(**engine_settings(options))
 
 
 def _auto(options: Options) -> Simulator:
@@ -46,7 +46,7 @@ def _auto(options: Options) -> Simulator:
     return _compiled(options)
 
 
-def _settings(options: Options) -> dict[str, Any]:
+def engine_settings(options: Options) -> dict[str, Any]:
     """Return the constructor arguments that all engines share."""
     return {'table': options.table, 'table_height': options.table_height, 'nodes': options.nodes,
             'time_step': options.time_step, 'stable_distance': options.stable_distance,

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Callable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Simulator
@@ -28,6 +29,7 @@ class Setting:
     :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
     :param should_stop: asked often; once True, every stage ends with what it has so far.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
+    :param memory: what was simulated before an interruption; every stage asks it first.
     """
 
     trials: tuple[Trial, ...]
@@ -36,14 +38,21 @@ class Setting:
     executor: Executor | None = None
     should_stop: Callable[[], bool] = lambda: False
     on_evaluation: Callable[[Evaluation], None] = lambda _: None
+    memory: Memory = field(default_factory=Memory)
 
     @property
     def chooses_parts(self) -> bool:
         """Whether cross-validation over the trials chooses the number of parts."""
         return self.options.parts == 0 and len(self.trials) > 1 and 'flexibility' in self.options.calibrate
 
+    @property
+    def own_simulator(self) -> Simulator:
+        """The engine for stages that simulate in this thread; it remembers each rollout."""
+        return self.memory.simulator(self.simulator)
+
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
-                 simulator: Simulator | None = None) -> BatchEvaluator:
+                 finer: Simulator | None = None) -> BatchEvaluator:
         """Return an evaluator of points of a space, by default with the setting's trials and engine."""
-        evaluator = Evaluator(trials or self.trials, space, simulator or self.simulator)
-        return BatchEvaluator(evaluator, self.should_stop, self.executor)
+        evaluator = Evaluator(trials or self.trials, space, finer or self.simulator)
+        return BatchEvaluator(evaluator, self.should_stop, self.executor,
+                              self.memory.of(evaluator, finer is not None))

@@ -20,6 +20,7 @@ from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.missing_parameters import missing_parameters
@@ -34,7 +35,7 @@ def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
     if result.examination is None or not result.examination.regular:
         return result
     return replace(result, advice=advise(
-        result.trials, result.space, setting.simulator, result.best.point, result.examination.uncertainty,
+        result.trials, result.space, setting.own_simulator, result.best.point, result.examination.uncertainty,
         result.length, setting.should_stop))
 
 
@@ -49,19 +50,22 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
         return result
     try:
         return replace(result, missing_parameters=missing_parameters(
-            Evaluator(result.trials, result.space, setting.simulator),
+            Evaluator(result.trials, result.space, setting.own_simulator),
             Linearisation(best.point, best.residuals, found.jacobian), setting.should_stop))
     except CancelledError:
         return result
 
 
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
-              should_stop: Callable[[], bool] = lambda: False) -> CalibrationResult:
+              should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None
+              ) -> CalibrationResult:
     """
     Return a result with the confirmation by a second engine, if `options` name none (auto).
 
     This costs one evaluation. If the engines disagree, or the second one fails, the result only gets a
     warning.
+
+    :param memory: what was simulated before an interruption; None: nothing.
     """
     if options.engine != AUTO or result.engine == CONFIRMING:
         return result
@@ -72,7 +76,9 @@ def confirmed(result: CalibrationResult, options: Options, make_simulator: Simul
 
     try:
         with closing(make_simulator(replace(options, engine=CONFIRMING))) as simulator:
-            return result if simulator.name == result.engine else _confirmed(result, simulator, late)
+            if simulator.name == result.engine:
+                return result
+            return _confirmed(result, (memory or Memory()).simulator(simulator), late)
     except CancelledError:
         words = 'stopped on request'
     except DloCalibrationError as error:

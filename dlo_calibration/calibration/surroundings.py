@@ -59,7 +59,7 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
         examination = examine(
             best.point, best.residuals, ResidualLayout.of(trials), evaluate.residuals,
             default=default, noise=sigma,
-            finer=None if finer is None else setting.evaluate(space, simulator=finer).residuals,
+            finer=None if finer is None else setting.evaluate(space, finer=finer).residuals,
             starts=[setting.evaluate(space, others).residuals
                     for others in _other_starts(trials, sigma)] if noisy else [], thorough=thorough)
     finally:

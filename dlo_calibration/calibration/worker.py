@@ -17,6 +17,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.model.trial import Trial
 
 
@@ -68,17 +69,24 @@ class Worker:
         """Tell whether the thread is running; afterwards, events may still be waiting."""
         return self._thread is not None and self._thread.is_alive()
 
-    def start(self, trials: Sequence[Trial], options: Options) -> None:
+    @property
+    def stopped(self) -> bool:
+        """Tell whether the last calibration was asked to end with the best so far."""
+        return self._stop.is_set()
+
+    def start(self, trials: Sequence[Trial], options: Options, log: EvaluationLog | None = None) -> None:
         """
         Begin to calibrate.
 
+        :param log: of finished evaluations, see `calibrate`; it belongs to the calibration until its end.
         :raises DloCalibrationError: while it is calibrating already.
         """
         if self.alive:
             raise DloCalibrationError('a calibration is under way already')
         self._stop = threading.Event()
         self._thread = threading.Thread(
-            target=self._work, args=(tuple(trials), options, self._stop), name='calibration', daemon=True)
+            target=self._work, args=(tuple(trials), options, log, self._stop), name='calibration',
+            daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -99,12 +107,13 @@ class Worker:
             self._thread.join(timeout)
         return not self.alive
 
-    def _work(self, trials: Sequence[Trial], options: Options, stop: threading.Event) -> None:
+    def _work(self, trials: Sequence[Trial], options: Options, log: EvaluationLog | None,
+              stop: threading.Event) -> None:
         event: Event
         try:
             event = calibrate(trials, options, on_evaluation=self.events.put,
                               on_notice=lambda text: self.events.put(Notice(text)),
-                              should_stop=stop.is_set, make_simulator=self._make_simulator)
+                              should_stop=stop.is_set, make_simulator=self._make_simulator, log=log)
         except DloCalibrationError as error:
             event = Failure(str(error))
         except BaseException as error:  # a thread that dies silently leaves the user waiting for ever

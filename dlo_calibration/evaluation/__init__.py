@@ -9,9 +9,12 @@ from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.log import EvaluationLog
+from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 
-__all__ = ['BatchEvaluator', 'ClusterExecutor', 'Evaluation', 'Evaluator', 'Huber', 'Linearisation',
-           'ProcessExecutor', 'ResidualLayout', 'SimulatorApart']
+__all__ = ['BatchEvaluator', 'ClusterExecutor', 'Evaluation', 'EvaluationLog', 'Evaluator', 'Huber',
+           'Linearisation', 'Memory', 'ProcessExecutor', 'ResidualLayout',
+           'SimulatorApart']

@@ -12,6 +12,7 @@ from __future__ import annotations
 from concurrent.futures import CancelledError, Executor, Future
 import copy
 import pickle
+import queue
 import threading
 from typing import Callable, Iterator, Sequence
 import uuid
@@ -19,6 +20,7 @@ import weakref
 
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.memory import EvaluatorMemory, Memory
 from dlo_calibration.model.chain import Floats
 
 
@@ -30,11 +32,14 @@ class BatchEvaluator:
 
     :param should_stop: asked again and again; True ends the batch.
     :param executor: runs the evaluations; None: this thread does.
+    :param memory: has the evaluations that need not be simulated again, and gets each new one as soon as it
+        is finished; None: nothing is remembered.
     """
 
     def __init__(self, evaluator: Evaluator, should_stop: Callable[[], bool],
-                 executor: Executor | None) -> None:
+                 executor: Executor | None, memory: EvaluatorMemory | None = None) -> None:
         self.evaluator = evaluator
+        self._memory = memory or Memory().of(evaluator)
         self._should_stop = should_stop
         self._executor = executor
         self._parcel = _Parcel(evaluator)
@@ -42,28 +47,53 @@ class BatchEvaluator:
 
     def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
         """Yield the evaluations of (k, d) points; the first one has the index `first`."""
-        if self._executor is None:
-            for k, point in enumerate(points):
+        if self._executor is not None:
+            yield from self._in_parallel(points, first, self._executor)
+            return
+        for index, point in enumerate(points, first):
+            evaluation = self._memory.find(index, point)
+            if evaluation is None:
                 try:
-                    yield self.evaluator.evaluate(first + k, point, self._should_stop)
+                    evaluation = self.evaluator.evaluate(index, point, self._should_stop)
                 except CancelledError:
                     return
-            return
-        futures: list[Future[Evaluation]] = [
-            self._executor.submit(_evaluate_in_worker, self._key, self._parcel, first + k, point)
-            for k, point in enumerate(points)]
+                self._memory.add(evaluation)
+            elif self._should_stop():
+                return
+            yield evaluation
+
+    def _in_parallel(self, points: Floats, first: int, executor: Executor) -> Iterator[Evaluation]:
+        known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
+        futures: dict[int, Future[Evaluation]] = {
+            k: executor.submit(_evaluate_in_worker, self._key, self._parcel, first + k, points[k])
+            for k, one in enumerate(known) if one is None}
+        finished: queue.SimpleQueue[Future[Evaluation]] = queue.SimpleQueue()
+        for future in futures.values():
+            future.add_done_callback(finished.put)
+        waiting = set(futures.values())
         try:
-            for future in futures:
-                while not future.done():
+            for k, evaluation in enumerate(known):
+                while futures.get(k) in waiting:
                     if self._should_stop():
                         return
-                    _wait(future)
+                    self._take(finished, waiting)
                 if self._should_stop():
                     return
-                yield future.result()
+                yield futures[k].result() if evaluation is None else evaluation
         finally:
-            for future in futures:
+            for future in futures.values():
                 future.cancel()
+
+    def _take(self, finished: queue.SimpleQueue[Future[Evaluation]], waiting: set[Future[Evaluation]]
+              ) -> None:
+        """Wait shortly for the next evaluation in the order in which they finish, and remember it."""
+        try:
+            future = finished.get(timeout=0.05)
+        except queue.Empty:
+            return
+        waiting.remove(future)
+        if not future.cancelled() and future.exception() is None:  # an error is raised when its turn comes
+            self._memory.add(future.result())
 
     def residuals(self, points: Floats) -> Sequence[Floats | None]:
         """
@@ -75,13 +105,6 @@ class BatchEvaluator:
         if len(found) < len(points):
             raise CancelledError
         return found
-
-
-def _wait(future: Future[Evaluation]) -> None:
-    try:
-        future.exception(timeout=0.05)
-    except TimeoutError:
-        pass
 
 
 class _Parcel:

@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A calibration that is interrupted goes on: nothing is simulated twice, and the result is the same."""
+
+from dataclasses import replace
+
+from mortal import Mortal
+import pytest
+from toy_messages import toy_trials
+
+from dlo_calibration import calibrate, EvaluationLog, Options
+from dlo_calibration.calibration.identity import calibration_digest, engine_digest
+from dlo_calibration.calibration.plain import evaluation_rows, plain
+
+CHOICES = {
+    'least squares': {'evaluations': 40},
+    'random': {'search': 'random', 'evaluations': 20},
+    'cma-es': {'search': 'cma_es', 'evaluations': 25, 'calibrate': ['flexibility', 'friction']},
+    'parts': {'parts': 0, 'evaluations': 60, 'calibrate': ['flexibility', 'friction']},
+}
+
+
+class Killed(BaseException):
+    """Stands for kill -9: nothing handles it."""
+
+
+def die():
+    raise Killed
+
+
+class Engines:
+    """The engines of one calibration: the searching one and the confirming one, which count together."""
+
+    def __init__(self, last=None):
+        self.last, self.made = last, []
+
+    def __call__(self, options):
+        before = self.count
+        self.made.append(Mortal('toy' if options.engine == 'auto' else 'bullet',
+                                None if self.last is None else self.last - before, die))
+        return self.made[-1]
+
+    @property
+    def count(self):
+        return sum(one.count for one in self.made)
+
+
+def told(result):
+    """Return all that a result tells, without the time that it took."""
+    return repr({**plain(result), 'seconds': 0}), repr(evaluation_rows(result))
+
+
+def options_of(name, workers=1):
+    return Options.of({'workers': workers, **CHOICES[name]})
+
+
+@pytest.mark.parametrize('name', CHOICES)
+def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
+    """It is killed in the search, in the examination, while it advises and while another engine confirms."""
+    options, trials, whole = options_of(name), toy_trials(3), Engines()
+    expected = told(calibrate(trials, options, make_simulator=whole))
+    assert len(whole.made) == 2
+    path = tmp_path / 'log'
+    simulated, kills = 0, 0
+    while True:
+        engines = Engines(last=whole.count // 6 + 2)
+        try:
+            with EvaluationLog(path) as log:
+                result = calibrate(trials, options, make_simulator=engines, log=log)
+            break
+        except Killed:
+            simulated += engines.count - 1
+            kills += 1
+    assert told(result) == expected
+    assert kills >= 4
+    # Each kill costs at most the trials of the evaluation under way.
+    assert simulated + engines.count <= whole.count + kills * (len(trials) - 1)
+
+
+@pytest.mark.parametrize('left', range(1, 60, 7))
+def test_what_comes_after_the_search_is_not_simulated_twice_either(left, tmp_path):
+    """Advice, missing parameters and confirmation are rollouts: each counts."""
+    options, trials, whole = options_of('least squares'), toy_trials(2), Engines()
+    with EvaluationLog(tmp_path / 'whole') as log:
+        expected = told(calibrate(trials, options, make_simulator=whole, log=log))
+    with EvaluationLog(tmp_path / 'log') as log:
+        with pytest.raises(Killed):
+            calibrate(trials, options, make_simulator=Engines(last=whole.count - left + 1), log=log)
+        engines = Engines()
+        assert told(calibrate(trials, options, make_simulator=engines, log=log)) == expected
+    assert left <= engines.count <= left + (len(trials) - 1)  # one evaluation in the examination
+
+
+@pytest.mark.parametrize('first, then', [(1, 2), (2, 1)])
+def test_it_goes_on_with_another_number_of_processes(first, then, tmp_path):
+    trials, seen = toy_trials(3), []
+
+    def stop_late(evaluation):
+        seen.append(evaluation)
+        if len(seen) == 20:
+            raise Killed
+
+    expected = told(calibrate(trials, options_of('random'), make_simulator=Engines()))
+    with EvaluationLog(tmp_path / 'log') as log:
+        with pytest.raises(Killed):
+            calibrate(trials, options_of('random', first), make_simulator=Engines(), log=log,
+                      on_evaluation=stop_late)
+        assert log.evaluations >= len(seen)
+        engines, again = Engines(), []
+        result = calibrate(trials, options_of('random', then), make_simulator=engines, log=log,
+                           on_evaluation=again.append)
+    assert told(result) == expected
+    assert [one.index for one in again] == list(range(20))
+
+
+def test_a_stopped_calibration_stays_stopped_and_goes_on_when_asked(tmp_path):
+    trials, options = toy_trials(2), options_of('random')
+    expected = told(calibrate(trials, options, make_simulator=Engines()))
+    seen = []
+    with EvaluationLog(tmp_path / 'log') as log:
+        for count in (5, 9):
+            seen.clear()
+            result = calibrate(trials, options, make_simulator=Engines(), log=log, on_evaluation=seen.append,
+                               should_stop=lambda count=count: len(seen) >= count)
+            assert (len(result.evaluations), result.stop_reason) == (count, 'stopped on request')
+        assert told(calibrate(trials, options, make_simulator=Engines(), log=log)) == expected
+
+
+def test_the_digest_leaves_out_the_machine_and_the_place_of_the_scene(tmp_path):
+    trials, options = toy_trials(2), Options()
+    digest = calibration_digest(trials, options)
+    for other in (replace(options, workers=7, output_directory='elsewhere', record=False),):
+        assert calibration_digest(trials, other) == digest
+    for other in (replace(options, seed=7), replace(options, nodes=21), replace(options, mass=0.1)):
+        assert calibration_digest(trials, other) != digest
+    assert calibration_digest(trials[::-1], options) != digest
+    scene = ('<robot name="a"><link name="b"><collision><geometry><box size="1 1 {}"/></geometry>'
+             '</collision></link></robot>')
+    digests = []
+    for name, height in (('a', 1), ('b', 1), ('c', 2)):
+        (tmp_path / name).write_text(scene.format(height), encoding='utf-8')
+        digests.append(engine_digest(Options(scene=str(tmp_path / name))))
+    assert digests[0] == digests[1] != digests[2] != engine_digest(options)

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The toy in a process that dies: `mortal.py SIMULATIONS VERB ...` is killed (-9) at that simulation.
+
+As a module: `Mortal`, an engine that counts its simulations.
+"""
+
+import os
+import signal
+import sys
+
+from toy_simulator import ToySimulator
+
+
+class Mortal(ToySimulator):
+    """
+    A toy that counts its simulations, and dies at one of them.
+
+    :param name: of the engine.
+    :param last: number of the simulation at which `die` is called.
+    """
+
+    def __init__(self, name='toy', last=None, die=None):
+        super().__init__(fail_below=20.0)
+        self.name, self.count, self.last, self.die = name, 0, last, die
+
+    def simulate(self, trial, physical):
+        """Count, and do what the toy does; it trembles, so that the residuals need an explanation."""
+        self.count += 1
+        if self.count == self.last:
+            self.die()
+        return super().simulate(trial, {**physical, 'friction': physical['friction'] * 1.1})
+
+
+def main():
+    """Execute a verb with a toy that kills this process."""
+    from drawings import leave_out_drawings
+
+    from dlo_calibration.cli import fit
+    from dlo_calibration.cli.main import main as execute
+
+    leave_out_drawings()
+    fit.sliced = lambda *_: None
+    toy = Mortal(last=int(sys.argv[1]), die=lambda: os.kill(os.getpid(), signal.SIGKILL))
+    return execute(sys.argv[2:], lambda _: toy)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
