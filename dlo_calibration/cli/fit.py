@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 import shutil
 import sys
@@ -18,7 +19,9 @@ from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.cli.options import given_options
 from dlo_calibration.cli.output import print_result, tell
 from dlo_calibration.cli.source import add_source, read_source, Source
-from dlo_calibration.errors import SimulationError
+from dlo_calibration.cli.unfinished import Unfinished
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.result import write_result
@@ -30,26 +33,53 @@ TEXT = 'find the parameters that explain a session best'
 # Names of the files in the output folder.
 RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
 REQUEST = 'request.xml'
+INPUTS = (REQUEST, SESSION)  # that an unfinished calibration keeps
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    add_source(parser)
-    parser.add_argument('--output', metavar='DIR', type=Path,
-                        help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} to this folder')
+    add_source(parser, optional=True)
+    written = parser.add_mutually_exclusive_group()
+    written.add_argument('--output', metavar='DIR', type=Path,
+                         help=f'write {RESULT}, {SESSION}, {REPORT} and {EVALUATIONS} to this folder; until '
+                         'then, each finished evaluation is kept there')
+    written.add_argument('--resume', metavar='DIR', type=Path,
+                         help='go on with a calibration that was interrupted, from what --output DIR kept; '
+                         'SESSION and options are those of its beginning')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
+    with ExitStack() as stack:
+        unfinished, log = None, None
+        if chosen.resume is not None:
+            if not Unfinished.is_in(chosen.resume):
+                return _say_finished(chosen.resume)
+            unfinished = stack.enter_context(Unfinished(chosen.resume, INPUTS))
+            unfinished.complete(chosen)
+        elif chosen.session is None:
+            raise InputError('fit', 'no SESSION', 'a session or a request', 'name it, or --resume DIR')
+        source = read_source(chosen, tell).require_trials()
+        folder = chosen.resume or chosen.output
+        if folder is None and 'output_directory' in given_options(chosen):
+            folder = Path(source.options.output_directory)
+        if folder is not None:
+            make_folder(folder)  # before hours are spent on a search
+            unfinished = unfinished or stack.enter_context(Unfinished(folder, INPUTS))
+            log = unfinished.begin(source, chosen.namespace, lambda path: _keep(path, source), tell)
+        stopped = _fit(chosen, source, folder, make_simulator, log)
+        if unfinished is not None and not stopped:
+            unfinished.remove()
+        elif log is not None:
+            tell(f'the calibration was stopped; it goes on with: dlo-calibration fit --resume {folder}')
+    return 0
+
+
+def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_simulator: SimulatorFactory,
+         log: EvaluationLog | None) -> bool:
+    """Calibrate, print the result, and write it; return whether the user stopped it."""
     from dlo_calibration.report.terminal import SearchBar
 
-    source = read_source(chosen, tell).require_trials()
-    folder = chosen.output
-    if folder is None and 'output_directory' in given_options(chosen):
-        folder = Path(source.options.output_directory)
-    files = [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
-    if folder is not None:
-        make_folder(folder)  # before hours are spent on a search
     told: list[str] = []
 
     def warn_once(text: str) -> None:
@@ -62,19 +92,43 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
             try:
                 result = calibrate(
                     source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
-                    should_stop=stop, make_simulator=make_simulator)
+                    should_stop=stop, make_simulator=make_simulator, log=log)
             except SimulationError:
                 if not stop():
+                    if log is not None:  # the same would happen again
+                        log.remove()
                     raise
                 raise KeyboardInterrupt(stop.exit_code) from None
+        stopped = stop()
         try:
             attempts = None if folder is None else _write_files(folder, source, result, make_simulator, stop)
         finally:  # whatever the disk does
             print_result(result, chosen.json, told)
         if attempts is not None:
             attempts.require()
-            tell(f'{", ".join(files)} are in {folder}')
+            tell(f'{", ".join(_files(source))} are in {folder}')
+    return stopped
+
+
+def _files(source: Source) -> list[str]:
+    return [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
+
+
+def _say_finished(folder: Path) -> int:
+    """Say that there is nothing to resume in a folder."""
+    if not (folder / RESULT).is_file():
+        raise InputError(f'folder {folder}', 'no interrupted calibration', 'one that fit --output began',
+                         'check the folder, or begin with fit SESSION --output')
+    tell(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
     return 0
+
+
+def _keep(folder: Path, source: Source) -> None:
+    """Write the input of a calibration to a folder, so that it can be read again."""
+    if source.is_request:
+        _copy(source.path, folder / REQUEST)
+    else:
+        _write_session(folder / SESSION, source)
 
 
 def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,

@@ -60,9 +60,9 @@ class Source:
         return self
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     """Add the arguments that name a source, and the options to use on it."""
-    parser.add_argument('session', metavar='SESSION', type=Path,
+    parser.add_argument('session', metavar='SESSION', type=Path, nargs='?' if optional else None,
                         help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
     add_common_arguments(parser)
     add_options(parser)
