@@ -110,6 +110,8 @@ class Worker:
     def _work(self, trials: Sequence[Trial], options: Options, log: EvaluationLog | None,
               stop: threading.Event) -> None:
         event: Event
+        if log is not None and log.resumed:
+            self.events.put(Notice(log.resumed))
         try:
             event = calibrate(trials, options, on_evaluation=self.events.put,
                               on_notice=lambda text: self.events.put(Notice(text)),

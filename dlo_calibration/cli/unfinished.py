@@ -110,7 +110,7 @@ class Unfinished:
             self.log = EvaluationLog(self.path / LOG)
             begun = None
         if count:
-            note(f'goes on after {count} evaluations of an interrupted calibration')
+            note(self.log.resumed)
         if begun is None:
             options = {name: value for name, value in source.options.flat().items()
                        if name not in names_of(MACHINE)}
@@ -127,10 +127,10 @@ class Unfinished:
     def _other(self, begun: Begun, source: Source, count: int) -> InputError:
         scene = begun.options['scene']
         return InputError(
-            f'folder {self._folder}', f'{count} evaluations of an interrupted calibration of other trials or '
-            'options, or by another version of dlo_calibration', 'the same',
+            f'folder {self._folder}', f'{count} evaluations of another calibration', 'the same trials, '
+            'options and version',
             f'add --scene {scene}, which it had' if scene and not source.options.scene else
-            f'go on with it by fit --resume {self._folder}, choose another --output, or remove {self.path}')
+            'use fit --resume for it, choose another --output, or remove its folder unfinished')
 
     def remove(self) -> None:
         """Remove the folder, as the result is written."""

@@ -83,6 +83,12 @@ class EvaluationLog:
         """Number of evaluations in it."""
         return sum(key.startswith(EVALUATION) for key in self._places)
 
+    @property
+    def resumed(self) -> str:
+        """A sentence for the user of a calibration that goes on with it; empty if it holds no evaluation."""
+        count = self.evaluations
+        return f'goes on after {count} evaluations of an interrupted calibration' if count else ''
+
     def find(self, key: str) -> Entry | None:
         """
         Return the entry with a key; None if there is none, or its line is damaged.

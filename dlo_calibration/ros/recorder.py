@@ -5,16 +5,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 import time
-from typing import Callable, Mapping
+from typing import Callable, Mapping, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.identity import calibration_digest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import InputError, unwritable
+from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.report.page import Origin, repeating_command
 from dlo_calibration.ros.report_writer import ReportWriter
 from dlo_calibration.writing import Attempts
@@ -37,6 +42,8 @@ class Recorder:
         self._session: SessionWriter | None = None
         self._missing: dict[Path, list[str]] = {}  # by the folder of a session that has not ended
         self._calibrated: SessionWriter | None = None  # the session of the calibration under way
+        self._log: EvaluationLog | None = None
+        self._written = False  # whether the result of the calibration is on the disk
 
     @property
     def folder(self) -> Path | None:
@@ -72,17 +79,50 @@ class Recorder:
         """Record how many messages of each kind were dropped since the session began."""
         self._write(lambda session: session.write_dropped(counts))
 
-    def start(self, options: Options) -> None:
-        """Record that a calibration with `options` starts, on the messages recorded so far."""
+    def start(self, trials: Sequence[Trial], options: Options) -> EvaluationLog | None:
+        """
+        Record that a calibration starts, on the messages recorded so far; return the log of its evaluations.
+
+        The log lies beside the sessions and is named after the trials and options, so that another session
+        with the same ones finds it after an interruption. It is removed when the result is on the disk.
+
+        :returns: None if the option `record` is not set, or the log cannot be opened.
+        :raises InputError: if the scene cannot be read.
+        """
+        self._log = self._open_log(trials, options) if options.record else None
+        self._written = False
         self._write(lambda session: session.write_options(options.flat()))
         self._write(lambda session: session.write_mark('start'))
         self._calibrated = self._session
+        return self._log
 
-    def finish(self) -> None:
-        """End the calibration; its session ends too, if another one has begun."""
+    def finish(self, *, interrupted: bool) -> None:
+        """
+        End the calibration; its session ends too, if another one has begun.
+
+        The log stays if a later calibration needs its evaluations.
+        """
         calibrated, self._calibrated = self._calibrated, None
         if calibrated is not self._session:
             self._write(SessionWriter.close, calibrated)
+        log, self._log = self._log, None
+        if log is not None:
+            with suppress(OSError):  # where nothing can be removed, an old log harms nobody
+                if not log.evaluations or self._written and not interrupted:
+                    log.remove()
+            log.close()
+
+    def _open_log(self, trials: Sequence[Trial], options: Options) -> EvaluationLog | None:
+        folder = Path(options.output_directory).expanduser()
+        name = f'dlo_unfinished_{calibration_digest(trials, options)}.log'
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            return EvaluationLog(folder / name)
+        except OSError as error:
+            self._on_failure(str(unwritable(folder, error, 'folder')))
+        except InputError as error:
+            self._on_failure(f'{error}; this calibration could not go on after an interruption')
+        return None
 
     def result(self, result: CalibrationResult, options: Options) -> None:
         """
@@ -99,6 +139,7 @@ class Recorder:
             name = f'evaluations{suffix}.csv'
             with attempts.attempt(name):
                 write_evaluations(folder / name, result)
+            self._written = not attempts.failure
             if attempts.failure:
                 self._miss(folder, attempts.failure)
             origin = Origin(folder.name, repeating_command(folder.name, options), options)
@@ -122,7 +163,7 @@ class Recorder:
 
     def close(self) -> None:
         """End the session, wait for its report, and tell what its folder lacks."""
-        self.finish()
+        self.finish(interrupted=True)
         self._write(SessionWriter.close)
         self._reporter.close()
         self.end()

@@ -226,13 +226,13 @@ class CalibrationSession:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
         self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
-        self._recorder.start(options)
+        log = self._recorder.start(trials, options)
         self._calibration = Calibration(options, Progress(options.evaluations, len(trials)), self._memory)
         memory = self._memory
-        memory.started, memory.state, memory.detail = True, 'calibrating', ''
+        memory.started, memory.state, memory.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
         memory.appraisal.wanted = True  # again after the calibration, as this one was stopped
-        self._worker.start(trials, options)
+        self._worker.start(trials, options, log)
         return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
 
     def _start_by_itself(self) -> None:
@@ -294,7 +294,7 @@ class CalibrationSession:
         self._send_progress(calibration)
         self._worker.join()
         if isinstance(event, Failure):
-            self._recorder.finish()
+            self._recorder.finish(interrupted=True)
             self.fail(event.text, f'calibration failed: {event.text}', *filter(None, [event.details]))
             return
         memory, options = self._memory, calibration.options
@@ -313,7 +313,7 @@ class CalibrationSession:
         self._send('dlo_description', self._types.build(
             OUTPUT_TYPES['dlo_description'], data=description_document(event, options.flat()).decode()))
         self._recorder.result(event, options)
-        self._recorder.finish()
+        self._recorder.finish(interrupted=self._worker.stopped)
         self._show()
         self._report()
 

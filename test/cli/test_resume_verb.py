@@ -12,6 +12,7 @@ import sys
 import mortal
 from mortal import Mortal
 import pytest
+from serial import serial
 from toy_messages import session_messages, write_session
 
 from dlo_calibration.cli import fit
@@ -42,7 +43,7 @@ def act(capsys):
     """Give a function that executes a verb: its code, its output and errors, and its engine."""
     def act(*words, toy=None):
         toy = toy or Mortal()
-        code = cli.main([str(word) for word in words], lambda _: toy)
+        code = cli.main(serial(words), lambda _: toy)
         return code, *capsys.readouterr(), toy
 
     return act
@@ -69,7 +70,7 @@ def abandon(act):
 def killed(simulation, *words):
     """Execute a verb in a process that is killed at a simulation."""
     done = subprocess.run(
-        [sys.executable, mortal.__file__, str(simulation), *map(str, words)], capture_output=True, text=True,
+        [sys.executable, mortal.__file__, str(simulation), *serial(words)], capture_output=True, text=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
     assert done.returncode == -signal.SIGKILL, done.stderr
 
@@ -110,8 +111,7 @@ def test_the_same_command_goes_on_and_another_calibration_is_not_lost(session, t
     abandon(30, 'fit', session, '--output', out, *FLAGS)
     code, _, errors, _ = act('fit', session, '--output', out, *FLAGS, '--seed', 4)
     assert code == 2
-    assert errors.splitlines()[-1].startswith(f'dlo-calibration: folder {out}: got 15 evaluations ')
-    assert errors.endswith(f'fit --resume {out}, choose another --output, or remove {out / "unfinished"}\n')
+    assert errors.splitlines()[-1].startswith(f'dlo-calibration: folder {out}: got 15 evaluations of another')
     code, _, errors, toy = act('fit', session, '--output', out, *FLAGS)
     assert code == 0
     assert 'goes on after 15 evaluations of an interrupted calibration' in errors
@@ -134,7 +134,7 @@ def test_other_options_are_refused_and_those_of_the_machine_are_not(words, part,
             code, errors = end.code, capsys.readouterr().err
     assert code == 2
     assert part in errors
-    assert act('fit', '--resume', out, '--workers', 2, '--seed', 3)[0] == 0
+    assert act('fit', '--resume', out, '--record', '--seed', 3)[0] == 0
     assert names(out) == FINISHED
 
 
@@ -144,7 +144,7 @@ def test_a_session_that_is_named_again_must_have_the_same_trials(session, tmp_pa
     other = write_session(tmp_path / 'other', session_messages(bag_types(), 1), {'workers': 1})
     code, _, errors, _ = act('fit', other, '--resume', out)
     assert code == 2
-    assert 'of an interrupted calibration of other trials or options' in errors
+    assert 'of another calibration' in errors
     assert act('fit', session, '--resume', out)[0] == 0
 
 

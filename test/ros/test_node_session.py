@@ -6,21 +6,25 @@
 import errno
 import os
 from pathlib import Path
+import threading
 import time
 
+from mortal import Mortal
 import pytest
 from result_message import result_values
-from toy_graph import ToyGraph, TYPES, values, whole
+from toy_graph import PATIENCE, ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
 from wrong_input import with_point
 
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.calibration.identity import calibration_digest
+from dlo_calibration.evaluation import EvaluationLog
 from dlo_calibration.files import recording
 from dlo_calibration.files.bag import encode
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_description, read_result
-from dlo_calibration.files.session import read_session
+from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.quantity import number
 
@@ -457,3 +461,49 @@ def test_log_times_never_go_back_though_the_clock_of_the_machine_does(start, tmp
     session = read_session(folder)
     assert session.records[-1].name == 'status'
     assert whole(live)['trials'] == str(len(session.trials)) == '1'
+
+
+def unfinished(path):
+    return list(path.glob('dlo_unfinished_*'))
+
+
+def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_path):
+    """Whoever sends the trials of an interrupted session again need not wait for its evaluations again."""
+    toys, results = [Mortal() for _ in range(3)], []
+    reached, going_on = threading.Event(), threading.Event()
+
+    def wait():
+        reached.set()
+        assert going_on.wait(PATIENCE)
+
+    toys[0].last, toys[0].die = 60, wait
+    for toy, record in zip(toys, (True, True, False), strict=True):
+        graph = start(toy, evaluations=60, search='random', record=record)
+        graph.send(session_messages(TYPES, 2))
+        assert graph.session.request('start')[0]
+        if toy.last:
+            assert reached.wait(PATIENCE)
+            assert len(unfinished(tmp_path)) == 1
+            assert graph.session.request('stop')[0]
+            going_on.set()
+        else:
+            count = whole(results[0])['evaluations']
+            told = f'goes on after {count} evaluations of an interrupted calibration'
+            assert (graph.status['detail'] == told) == record
+        graph.until(lambda graph=graph: graph.status['state'] == 'done')
+        results.append(graph.heard['result'][-1])
+        assert any('goes on after' in text for text in graph.logged['warn']) == (toy is toys[1])
+        assert len(unfinished(tmp_path)) == (toy is toys[0])
+        graph.session.close()
+    assert 'stopped on request' in whole(results[0])['stop_reason']
+    assert repr(result_values(results[1])) == repr(result_values(results[2]))
+
+
+def test_without_a_log_it_calibrates_all_the_same_and_says_so(start, tmp_path):
+    graph = start()
+    graph.send(session_messages(TYPES, 1))
+    trials, _ = session_trials(read_session(folders(tmp_path)[0]), graph.options())
+    digest = calibration_digest(trials, graph.options())
+    with EvaluationLog(tmp_path / f'dlo_unfinished_{digest}.log'):
+        graph.calibrated()
+    assert any('another calibration is using' in text for text in graph.logged['error'])
