@@ -29,6 +29,7 @@ CAMPAIGNS: tuple[str, ...] = (
     'fuzz',
     'interrupt',
     'kill',
+    'resume',
     'scenes',
 )
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')

@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A verb with a witness: `witness.py FILE VERB ...` appends a letter to FILE for whatever happens.
+
+S: a simulation begins, in whatever process; E: an evaluation is told to the user.
+"""
+
+import functools
+import os
+import sys
+
+from drawings import leave_out_drawings
+from toy_simulator import ToySimulator
+
+from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.cli import fit
+from dlo_calibration.cli import main as cli
+from dlo_calibration.report.terminal import SearchBar
+
+
+def note(path, letter):
+    """Append a letter, at once."""
+    file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+    os.write(file, letter)
+    os.close(file)
+
+
+class Witness:
+    """An engine whose simulations are counted in a file."""
+
+    def __init__(self, engine, path):
+        self.name, self.engine, self.path = engine.name, engine, path
+
+    def simulate(self, trial, physical):
+        """Count, and simulate."""
+        note(self.path, b'S')
+        return self.engine.simulate(trial, physical)
+
+    def prepare(self):
+        """Prepare the engine."""
+        self.engine.prepare()
+
+    def refined(self):
+        """Return the refined engine, which counts, too."""
+        finer = self.engine.refined()
+        return None if finer is None else Witness(finer, self.path)
+
+    def close(self):
+        """Close the engine."""
+        self.engine.close()
+
+
+def make(path, options):
+    """Return the engine of the options; the toy in place of `compiled` alone, as it loads faster."""
+    return Witness(ToySimulator(0.01) if options.engine == 'compiled' else make_simulator(options), path)
+
+
+def main():
+    """Execute the verb."""
+    path, take = sys.argv[1], SearchBar.take
+
+    def told(bar, evaluation):
+        note(path, b'E')
+        take(bar, evaluation)
+
+    SearchBar.take = told
+    leave_out_drawings()
+    fit.sliced = lambda *_: None  # simulates as much as the time allows
+    return cli.main(sys.argv[2:], functools.partial(make, path))
+
+
+if __name__ == '__main__':
+    import witness  # a process that simulates does not know what the main module defines
+
+    sys.exit(witness.main())
