@@ -79,7 +79,9 @@ class Unfinished:
                              f'use fit SESSION --output {self._folder}, with the options of the beginning')
         given, machine = given_options(chosen), names_of(MACHINE)
         for name, value in given.items():
-            if name not in machine and Options.of({name: value}).flat()[name] != begun.options[name]:
+            if name in (*machine, 'scene'):  # of a scene, the content counts, which `begin` compares
+                continue
+            if Options.of({name: value}).flat()[name] != begun.options[name]:
                 raise InputError(f'option {name} beside --resume', f'{value}',
                                  f'{begun.options[name]}, as at the beginning',
                                  'leave it out, or begin anew with fit SESSION and another --output')

@@ -88,7 +88,8 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
     session = write_session(folder / 'session', session_messages(bag_types(), 3), {**SMALL, **choice})
     words = ('fit', session, '--seed', choose.randrange(1000), '--json', '--workers')
     out = folder / 'out'
-    whole = live(folder, *words, 1, '--output', folder / 'whole')
+    # With two processes, as these also simulate points twice that are twice in one batch.
+    whole = live(folder, *words, 2, '--output', folder / 'whole')
     expected, kills, told, simulations, slack = contents(folder / 'whole'), 0, 0, 0, 0
     while True:
         workers = choose.choice((1, 1, 2))
