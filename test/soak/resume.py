@@ -29,7 +29,7 @@ import witness
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
 
-SHORT, FULL = 1, 26
+SHORT, FULL = 1, 14
 PATIENCE = 120.0  # s that a process may take
 MOST = 4  # kills of one calibration
 SMALL = {'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.3}
