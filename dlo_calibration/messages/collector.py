@@ -185,12 +185,10 @@ class TrialCollector:
     def _insert(self, message: Message, key: Key) -> InputError | None:
         """Take a message that is earlier than another; return the reason if it is not used."""
         begin = end = self._place(key)
-        waiting, folded, found = [message], list[TrialBuilder](), None
+        kept, later = self._builders[begin].divided(key)
+        waiting, folded, found = [message, *later], [kept], None
         # Further builders change only until an initial chain begins the next trial.
-        while end < len(self._builders) and not (end > begin and folded[-1].busy):
-            waiting = sorted([*waiting, *self._builders[end].messages()], key=order)
-            if not folded:
-                folded.append(TrialBuilder(self._builders[begin].first))
+        while waiting:
             for one in waiting:
                 orphans = begin == 0 and len(folded) == 1
                 if one.kind == INITIAL and folded[-1].busy and (folded[-1].starts or orphans):
@@ -198,8 +196,9 @@ class TrialCollector:
                 error = folded[-1].extend(one, self._options)
                 if one is message:
                     found = error
-            waiting = []
             end += 1
+            more = end < len(self._builders) and not folded[-1].busy
+            waiting = self._builders[end].messages() if more else []
         self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._builders[begin:end])
         self._builders[begin:end] = folded
         if begin == 0 and len(self._builders) > 1 and order(message) < self._builders[1].first:

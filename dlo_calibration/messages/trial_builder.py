@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from typing import Iterable, Union
 
@@ -46,6 +47,10 @@ class GoalView:
     names: tuple[str, ...]
     stable: bool
     held_by: tuple[str, ...]
+
+
+def _message_order(entry: Move | GoalView) -> Key:
+    return order(entry.message)
 
 
 @dataclass
@@ -91,6 +96,18 @@ class TrialBuilder:
         return sorted([*self.starts, *(one.message for one in self.moves), *self.waiting,
                        *(one.message for one in self.views),
                        *(message for message, _ in self.refused)], key=order)
+
+    def divided(self, key: Key) -> tuple[TrialBuilder, list[Message]]:
+        """Return a builder of the messages before a key, as it was then, and the later messages in order."""
+        # What becomes of a message depends only on those before it, so nothing is judged anew.
+        early, late = TrialBuilder(self.first), TrialBuilder(self.first)
+        for name, place in (('starts', order), ('moves', _message_order), ('views', _message_order),
+                            ('waiting', order), ('refused', lambda pair: order(pair[0]))):
+            entries = getattr(self, name)
+            count = bisect_left(entries, key, key=place)
+            setattr(early, name, entries[:count])
+            setattr(late, name, entries[count:])
+        return early, late.messages()
 
     def extend(self, message: Message, options: Options) -> InputError | None:
         """Take a message that is later than all others; return the reason if it is refused."""
