@@ -224,7 +224,7 @@ def test_folder_that_cannot_be_written_is_told_once_and_the_calibration_goes_on(
         robot.until_status(trials='1')
         assert robot.call('start').success
         robot.until_result()
-        assert 'cannot be written' in robot.status['last_refusal']
+        assert 'expected a place that can be written to' in robot.status['last_refusal']
 
 
 def test_folder_that_goes_away_is_told_and_the_calibration_goes_on(ros_environment, tmp_path):

@@ -79,12 +79,12 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
         if turn % NODE_TURN == NODE_TURN - 1:
             of_node(place, tally, choose)
         else:
-            of_fit(place, tally, choose, CHOICES[turn % NODE_TURN % len(CHOICES)])
+            of_fit(place, tally, choose, CHOICES[turn % NODE_TURN % len(CHOICES)], MOST if amount > SHORT else 1)
     return tally
 
 
-def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, Any]) -> None:
-    """Kill `fit` and its resumptions, and compare what it writes with what one writes that nobody kills."""
+def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, Any], most: int) -> None:
+    """Kill `fit` and its resumptions, `most` times, and compare what it writes with what one writes that nobody kills."""
     session = write_session(folder / 'session', session_messages(bag_types(), 3), {**SMALL, **choice})
     words = ('fit', session, '--seed', choose.randrange(1000), '--json', '--workers')
     out = folder / 'out'
@@ -93,7 +93,7 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
     expected, kills, told, simulations, slack = contents(folder / 'whole'), 0, 0, 0, 0
     while True:
         workers = choose.choice((1, 1, 2))
-        limit = choose.uniform(0.2, 1.0) * whole.seconds if kills < MOST else None
+        limit = choose.uniform(0.2, 1.0) * whole.seconds if kills < most else None
         begun = any((out / name).exists() for name in ('unfinished/evaluations.log', 'result.xml'))
         again = ('fit', '--resume', out, '--json', '--workers', workers)
         life = live(folder, *(again if begun else (*words, workers, '--output', out)), limit=limit)
