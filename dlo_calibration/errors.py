@@ -77,8 +77,11 @@ class InputError(DloCalibrationError):
 
     def __str__(self) -> str:
         form = '{}: got {}, expected {}; {}'
-        return form.format(*_fitting((self.thing, self.came, self.expected, self.remedy),
-                                     LONGEST - len(form.format(*[''] * 4))))
+        most = LONGEST - len(form.format(*[''] * 4))
+        # A user copies the name of the thing, and follows the remedy: these stay whole as long as possible.
+        thing, remedy = _fitting((self.thing, self.remedy), most - 100)
+        came, expected = _fitting((self.came, self.expected), most - len(thing) - len(remedy))
+        return form.format(thing, came, expected, remedy)
 
 
 class SimulationError(DloCalibrationError):

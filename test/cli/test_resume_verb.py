@@ -158,9 +158,10 @@ def test_a_log_that_is_no_log_is_refused_in_one_line(damage, session, tmp_path, 
     log.write_bytes(damage)
     code, _, errors, _ = act('fit', '--resume', out)
     assert code == 2
-    assert errors.startswith(f'dlo-calibration: log {log}: got no calibration, expected a log that fit has written; ')
-    assert errors.count('\n') == 1
+    assert errors.startswith('dlo-calibration: log ')
+    assert ': got no calibration, expected a log that ' in errors
     assert errors.endswith(', with the options of the beginning\n')
+    assert errors.count('\n') == 1
     log.write_bytes(before)
     assert act('fit', '--resume', out)[0] == 0
 

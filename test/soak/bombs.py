@@ -28,7 +28,7 @@ from dlo_calibration.model.chain import Chain
 
 SHORT, FULL = 1, 4  # how many verbs each bomb is given to
 VERBS = ('info', 'fit', 'validate', 'plot')
-IN_SHORT = 3  # bombs
+IN_SHORT = 2  # bombs
 PATIENCE = 180.0  # s; more than any fit takes on a busy machine
 LIMIT = 1e9  # bytes of memory
 TYPES = bag_types()

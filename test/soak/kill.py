@@ -27,7 +27,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session, session_trials
 
-SHORT, FULL = 2, 110
+SHORT, FULL = 1, 110
 ORPHANED = 5.0  # s that a process may outlive the node
 MOMENTS = ('calibrating', 'a process', 'writing', 'collecting')
 EVALUATIONS = {'calibrating': 10000, 'a process': 60, 'writing': 20, 'collecting': 20}
@@ -37,7 +37,10 @@ TRIALS = 2  # before the calibration
 def conduct(amount: int, seed: int, folder: Path) -> Tally:
     """Kill `amount` times, at the moments in turn."""
     tally, choose = Tally(), random.Random(seed)
-    scores: set[str] = set()  # of calibrations of which processes were killed
+    scores: set[str] = set()  # of calibrations of which processes were killed, and of one without
+    if amount > MOMENTS.index('a process'):
+        with _node(folder / 'whole', EVALUATIONS['a process']) as (process, robot):
+            scores.add(_scores(robot))
     for k in range(amount):
         moment = MOMENTS[k % len(MOMENTS)]
         tally.tried += 1
@@ -74,17 +77,24 @@ def _simulating(process):
     return [one for one, words in children(process.pid).items() if 'spawn_main' in words]
 
 
-def _kill_a_process(process, robot, choose):
-    """Kill one of the processes that simulate; return the scores of the result."""
+def _scores(robot):
+    """Return the scores of the result of a calibration, which begins now if none is under way."""
     from graph import whole
 
+    if not robot.heard['progress']:
+        assert robot.call('start').success
+    return whole(robot.until_result())['scores']
+
+
+def _kill_a_process(process, robot, choose):
+    """Kill one of the processes that simulate; return the scores of the result."""
     assert robot.call('start').success
     robot.until(lambda: robot.heard['progress'] and len(_simulating(process)) > 1)
     try:
         os.kill(choose.choice(_simulating(process)), signal.SIGKILL)
     except ProcessLookupError:
         pass  # the calibration has just ended
-    return whole(robot.until_result())['scores']
+    return _scores(robot)
 
 
 def _kill_the_node(process, robot, moment, choose, tally):

@@ -79,12 +79,13 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
         if turn % NODE_TURN == NODE_TURN - 1:
             of_node(place, tally, choose)
         else:
-            of_fit(place, tally, choose, CHOICES[turn % NODE_TURN % len(CHOICES)], MOST if amount > SHORT else 1)
+            choice = CHOICES[turn % NODE_TURN % len(CHOICES)]
+            of_fit(place, tally, choose, choice, MOST if amount > SHORT else 1)
     return tally
 
 
 def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, Any], most: int) -> None:
-    """Kill `fit` and its resumptions, `most` times, and compare what it writes with what one writes that nobody kills."""
+    """Kill `fit` and its resumptions, `most` times, and compare what it writes with one that nobody kills."""
     session = write_session(folder / 'session', session_messages(bag_types(), 3), {**SMALL, **choice})
     words = ('fit', session, '--seed', choose.randrange(1000), '--json', '--workers')
     out = folder / 'out'

@@ -19,7 +19,7 @@ import time
 import numpy as np
 from tally import finish, Tally, verb
 
-SHORT, FULL = 28, 1200
+SHORT, FULL = 10, 1200
 EACH_FIT = 120  # scenes for each one that `fit` gets, too
 LIMIT = 120.0  # s for one scene; one that takes longer hangs
 
