@@ -113,9 +113,11 @@ class Intake:
             raise LimitExceeded(f'it has more than {self._messages - 1} messages in {self._size} bytes')
 
     def keep(self, record: Record) -> None:
-        """Keep a message."""
-        self._kept += len(record.data)
+        """Keep a message; what the node sent takes at most half of the room."""
         limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
+        if record.name in OUTPUT_TYPES and (2 * len(self.records) >= limit or 2 * self._kept > KEPT_OCTETS):
+            return
+        self._kept += len(record.data)
         if len(self.records) >= limit or self._kept > KEPT_OCTETS:
             raise LimitExceeded(f'it has more than {limit} messages or {KEPT_OCTETS / 1e6:.0f} MB '
                                 'on the topics of the calibrator')

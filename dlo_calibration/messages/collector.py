@@ -32,7 +32,8 @@ message of the same kind and stamp (and the same hands) is refused, unless the f
 one was refused: then it replaces that one.
 
 Of the messages that no trial uses, between half of KEPT and KEPT are remembered, the
-latest ones.  A message that is older than these is refused.
+latest ones.  A message that is older than these is refused.  When all remembered messages
+are too large together, those that no trial uses are forgotten; then further ones are refused.
 """
 
 from __future__ import annotations
@@ -43,11 +44,13 @@ from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import INITIAL
+from dlo_calibration.messages.codec import ActionMessage, INITIAL
 from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
 from dlo_calibration.model.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
+MOST_MESSAGES = 300_000  # nearly three hours of a tracker at 30 Hz, which take about 700 MB
+MOST_NUMBERS = 30_000_000  # coordinates in them, which take 240 MB
 
 
 class TrialCollector:
@@ -68,6 +71,7 @@ class TrialCollector:
         self._frame: str | None = None
         self._builders = [TrialBuilder((0, 0, ()))]
         self._known: dict[Key, Message] = {}
+        self._numbers = 0  # coordinates in them
         self._newest: Key = (0, 0, ())
         self._spare = 0
         self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
@@ -95,6 +99,7 @@ class TrialCollector:
         self._check(message, key)
         self._frame = message.frame_id
         self._known[key] = message
+        self._numbers += _size(message)
         last, without_start = self._builders[-1], len(self._builders) == 1
         if key > self._newest:
             self._newest = key
@@ -109,7 +114,7 @@ class TrialCollector:
         if without_start and len(self._builders) > 1:
             self._news += self._orphans()
         if self._spare > KEPT:
-            self._forget()
+            self._forget(KEPT // 2)
         if error is not None:
             raise error
 
@@ -168,6 +173,12 @@ class TrialCollector:
         if any(begin <= key < end for begin, end in self._forgotten):
             raise InputError(str(message), f'it after more than {KEPT // 2} later messages',
                              'messages in about the order of their stamps', 'send it earlier, or reset')
+        if self._full(message) and self._spare:
+            self._forget(0)
+        if self._full(message):
+            raise InputError(str(message), f'it after {len(self._known)} messages',
+                             f'at most {MOST_MESSAGES} with {MOST_NUMBERS} coordinates',
+                             'calibrate with these, or reset to begin anew')
         if key not in self._known:
             return
         builder = self._builders[self._place(key)]
@@ -175,8 +186,13 @@ class TrialCollector:
         if len(others) == len(builder.refused):
             raise InputError(str(message), f'a second {message.kind} with this stamp', 'one',
                              'stamp every message with its own time, or reset to begin anew')
+        self._drop(one for one, _ in builder.refused if order(one) == key)
         builder.refused = others
         self._spare -= 1
+
+    def _full(self, message: Message) -> bool:
+        """Tell whether a message would be too much."""
+        return len(self._known) >= MOST_MESSAGES or self._numbers + _size(message) > MOST_NUMBERS
 
     def _place(self, key: Key) -> int:
         """Return the index of the builder to which a message belongs."""
@@ -217,9 +233,9 @@ class TrialCollector:
         waiting = sorted(self._builders[0].waiting, key=order)
         return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
-    def _forget(self) -> None:
-        """Forget the oldest messages that no trial uses, until half of KEPT are left."""
-        surplus = self._spare - KEPT // 2
+    def _forget(self, rest: int) -> None:
+        """Forget the oldest messages that no trial uses, until `rest` of them are left."""
+        surplus = self._spare - rest
         kept: list[TrialBuilder] = []
         for builder, following in zip(self._builders, [*self._builders[1:], None], strict=True):
             before = builder.spare
@@ -257,6 +273,7 @@ class TrialCollector:
     def _drop(self, messages: Iterable[Message]) -> None:
         for message in messages:
             del self._known[order(message)]
+            self._numbers -= _size(message)
 
     def _close(self, begin: Key, end: Key) -> None:
         """From now on, refuse messages with keys from `begin` up to, but not including, `end`."""
@@ -268,6 +285,13 @@ class TrialCollector:
             else:
                 merged.append(span)
         self._forgotten = merged
+
+
+def _size(message: Message) -> int:
+    """Return the number of coordinates in a message."""
+    if isinstance(message, ActionMessage):
+        return message.positions.size + message.orientations.size
+    return message.chain.points.size
 
 
 def _cut_off(builder: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:

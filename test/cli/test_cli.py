@@ -392,8 +392,8 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     scene = session / 'my scene.urdf'
     scene.write_text(SCENE, encoding='utf-8')
     documents = []
-    for source in ([str(session)], ['out/session.mcap', '--scene', str(scene)]):
-        assert cli.main(['fit', *source, '--workers', '1', '--json', '--output', 'out']) == 0
+    for words in ([str(session), '--output', 'out'], ['out/session.mcap', '--scene', str(scene)]):
+        assert cli.main(['fit', *words, '--workers', '1', '--json']) == 0
         documents.append(json.loads(capsys.readouterr().out))
     first, again = ({key: value for key, value in one.items() if key != 'seconds'} for one in documents)
     assert first == again

@@ -472,6 +472,21 @@ def test_refusals_do_not_pile_up(monkeypatch):
     assert len(collector.trials[0].goals) == 2
 
 
+@pytest.mark.parametrize(('name', 'most'), [('MOST_MESSAGES', 20), ('MOST_NUMBERS', 19 * 33 + 15)])
+def test_what_is_too_much_is_refused_after_what_no_trial_uses_is_forgotten(monkeypatch, name, most):
+    monkeypatch.setattr(module, name, most)
+    collector = collect(initial(1), action(2), goal(5))
+    for k in range(10):
+        refused(collector, goal(10 + k, count=12))
+    for k in range(17):
+        collector.add(goal(30 + k))
+    assert collector.problems == ()
+    assert 'calibrate with these, or reset' in refused(collector, goal(60))
+    assert [len(t.goals) for t in collector.trials] == [18]
+    collector.clear()
+    collector.add(initial(61))
+
+
 # ---- any order of arrival
 
 @st.composite

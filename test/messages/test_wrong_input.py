@@ -217,7 +217,7 @@ def collected(messages):
     return collector
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
 def test_mutated_bytes_are_collected_or_refused(messages):
     collector = collected([
@@ -227,7 +227,7 @@ def test_mutated_bytes_are_collected_or_refused(messages):
         score_of(collector.trials)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(data=st.data())
 def test_mutated_fields_are_collected_or_refused(data):
     originals = fuzzed_pairs(FILES, 'world')
@@ -239,7 +239,7 @@ def test_mutated_fields_are_collected_or_refused(data):
         score_of(collector.trials)
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('camera'), min_size=1, max_size=12))
 def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     for kind, octets in messages:
@@ -248,7 +248,7 @@ def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     assert topics.robot.status['trials'] == '2'
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6), good_last=st.booleans())
 def test_mutated_bytes_in_a_file_end_in_a_result_or_one_line(tmp_path_factory, command, messages, good_last):
     path = tmp_path_factory.mktemp('mutated') / 'session.mcap'

@@ -16,6 +16,7 @@ import subprocess
 import time
 
 from domain import ros_graph
+from mcap.reader import make_reader
 import numpy as np
 from tally import peak_of, Tally
 from toy_messages import MINUTE, session_messages
@@ -69,13 +70,22 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             tally.died += 1
     try:
         session_folder, = (folder / 'out').glob('dlo_session_*')
-        session = read_session(session_folder)
-        heard = sum(record.name in INPUT_TYPES for record in session.records)
-        tally.refused = _dropped(session)
+        tally.refused = _dropped(read_session(session_folder))
+        heard = _recorded(session_folder)
         tally.lost = abs(sent - heard - tally.refused)
     except (InputError, ValueError):
         tally.lost = sent
     return tally
+
+
+def _recorded(folder):
+    """Return how many input messages are in a recording, also beyond those that are kept when it is read."""
+    file, = folder.glob('*.mcap')
+    with file.open('rb') as stream:
+        about = make_reader(stream).get_summary()
+    counts = about.statistics.channel_message_counts
+    return sum(count for number, count in counts.items()
+               if about.channels[number].topic.rsplit('/', 1)[-1] in INPUT_TYPES)
 
 
 def _messages(types):

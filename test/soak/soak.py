@@ -13,7 +13,9 @@ here) and `conduct(amount, seed, folder)`, which returns a `Tally`.
 from __future__ import annotations
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
 import importlib
+from multiprocessing import get_context
 from pathlib import Path
 import sys
 import tempfile
@@ -21,6 +23,8 @@ import time
 
 FOLDER = Path(__file__).resolve().parent
 sys.path += [str(FOLDER.parent / 'support'), str(FOLDER), str(FOLDER.parent)]
+
+from tally import Tally  # noqa: E402
 
 CAMPAIGNS: tuple[str, ...] = (
     'bombs',
@@ -42,17 +46,23 @@ def main() -> int:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--amount', type=int, help='how much each campaign tries; default: its own FULL')
     chosen = parser.parse_args()
-    rows, bad = [HEAD, ('---',) * len(HEAD)], 0
+    print('\n'.join(f'| {" | ".join(row)} |' for row in (HEAD, ('---',) * len(HEAD))), flush=True)
+    bad = False
     for name in chosen.campaign:
-        campaign = importlib.import_module(name)
-        begun = time.monotonic()
-        with tempfile.TemporaryDirectory(prefix=f'soak_{name}_') as folder:
-            tally = campaign.conduct(chosen.amount or campaign.FULL, chosen.seed, Path(folder))
-        rows.append((name, *tally.row(), f'{(time.monotonic() - begun) / 60:.1f}'))
-        bad += tally.lost + tally.died
-        print(f'{name}: {tally}', file=sys.stderr, flush=True)
-    print('\n'.join(f'| {" | ".join(row)} |' for row in rows))
-    return min(bad, 1)
+        # Each in a process of its own: the memory of a child is at least that of its parent.
+        with ProcessPoolExecutor(1, get_context('spawn')) as executor:
+            tally, minutes = executor.submit(conducted, name, chosen.amount, chosen.seed).result()
+        print(f'| {" | ".join((name, *tally.row(), f"{minutes:.1f}"))} |', flush=True)
+        bad = bad or tally.lost + tally.died > 0
+    return int(bad)
+
+
+def conducted(name: str, amount: int | None, seed: int) -> tuple[Tally, float]:
+    """Conduct a campaign in a folder of its own; return its tally, and the minutes that it took."""
+    campaign, begun = importlib.import_module(name), time.monotonic()
+    with tempfile.TemporaryDirectory(prefix=f'soak_{name}_') as folder:
+        tally = campaign.conduct(amount or campaign.FULL, seed, Path(folder))
+    return tally, (time.monotonic() - begun) / 60
 
 
 if __name__ == '__main__':
