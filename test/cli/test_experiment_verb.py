@@ -194,10 +194,9 @@ def started(session, out, workers):
     return process
 
 
-@pytest.mark.parametrize('workers', [1, 2])
-def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, workers, undrawn):
+def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, undrawn):
     out = tmp_path / 'out'
-    process = started(session, out, workers)
+    process = started(session, out, 2)
     begun = children(process.pid)
     process.kill()
     process.communicate()
@@ -255,7 +254,7 @@ def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, ma
     assert [one.name for one in (tmp_path / 'out').iterdir()] == ['calibrations.jsonl']
 
 
-@pytest.mark.parametrize(('workers', 'number'), [(1, signal.SIGINT), (2, signal.SIGINT), (2, signal.SIGTERM)])
+@pytest.mark.parametrize(('workers', 'number'), [(1, signal.SIGINT), (2, signal.SIGTERM)])
 def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
     process = started(session, tmp_path / 'out', workers)
     process.send_signal(number)

@@ -192,7 +192,7 @@ def test_slices_are_drawn_or_said_to_be_left_out(result, page, drawn):
 
 def test_of_many_trials_the_worst_are_drawn(page):
     trials = toy_trials(MOST_TRIALS + 3)
-    result = calibrate(trials, replace(OPTIONS, evaluations=20), make_simulator=new_toy)
+    result = calibrate(trials, replace(OPTIONS, evaluations=5), make_simulator=new_toy)
     text = page(result)
     assert text.count('seen from above') == MOST_TRIALS
     for trial in trials:
