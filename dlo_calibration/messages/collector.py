@@ -49,8 +49,8 @@ from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBui
 from dlo_calibration.model.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
-MOST_MESSAGES = 300_000  # nearly three hours of a tracker at 30 Hz, which take about 700 MB
-MOST_NUMBERS = 30_000_000  # coordinates in them, which take 240 MB
+MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
+MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
 
 class TrialCollector:

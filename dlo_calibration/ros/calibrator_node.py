@@ -166,10 +166,10 @@ class CalibratorNode(OptionsNode):
     # Subscriptions
 
     def _subscribe(self, kind: str, reliability: ReliabilityPolicy) -> Any:
-        # The queue holds a burst of goal chains while another callback works.
+        # The queue holds a burst of goal chains while another callback works, and at most 320 MB.
         return self.create_subscription(
             self._input_classes[kind], f'~/{kind}', functools.partial(self._hear, kind),
-            QoSProfile(depth=2000, reliability=reliability), raw=True,
+            QoSProfile(depth=1000, reliability=reliability), raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=functools.partial(self._on_incompatible_qos, kind),
                 message_lost=functools.partial(self._on_message_lost, kind),

@@ -10,6 +10,7 @@ not within a minute after SIGTERM.  Silence: the longest time until a request wa
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import signal
 import subprocess
@@ -70,8 +71,8 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             tally.died += 1
     try:
         session_folder, = (folder / 'out').glob('dlo_session_*')
-        tally.refused = _dropped(read_session(session_folder))
-        heard = _recorded(session_folder)
+        read_session(session_folder)
+        heard, tally.refused = _recorded(session_folder)
         tally.lost = abs(sent - heard - tally.refused)
     except (InputError, ValueError):
         tally.lost = sent
@@ -79,13 +80,19 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
 
 
 def _recorded(folder):
-    """Return how many input messages are in a recording, also beyond those that are kept when it is read."""
+    """
+    Return how many input messages are in a recording, and how many it says were dropped.
+
+    `read_session` does not read more than a limit.
+    """
     file, = folder.glob('*.mcap')
     with file.open('rb') as stream:
-        about = make_reader(stream).get_summary()
-    counts = about.statistics.channel_message_counts
-    return sum(count for number, count in counts.items()
-               if about.channels[number].topic.rsplit('/', 1)[-1] in INPUT_TYPES)
+        reader = make_reader(stream)
+        about = reader.get_summary()
+        heard = sum(count for number, count in about.statistics.channel_message_counts.items()
+                    if about.channels[number].topic.rsplit('/', 1)[-1] in INPUT_TYPES)
+        dropped = [one.metadata['dropped'] for one in reader.iter_metadata() if 'dropped' in one.metadata]
+    return heard, sum(json.loads(dropped[-1]).values()) if dropped else 0
 
 
 def _messages(types):
@@ -120,8 +127,3 @@ def _wait(robot):
         robot.executor.spin_once(timeout_sec=0.05)
         if len(robot.heard['status']) != seen:
             seen, since = len(robot.heard['status']), time.monotonic()
-
-
-def _dropped(session):
-    """Return how many messages the node counts as dropped, as `info` tells."""
-    return sum(int(text.split()[0]) for text in session.problems if text.endswith('were dropped'))
