@@ -115,14 +115,14 @@ def interrupted(command: list[str], folder: Path, number: int, delay: float, aga
         time.sleep(delay)
         early = not handles(process.pid)
         begun, sent, code, usage = time.monotonic(), False, None, None
-        process.send_signal(number)
+        os.kill(process.pid, number)  # unlike send_signal, this never waits for the process
         while time.monotonic() - begun < PATIENCE:
             ended, status, usage = os.wait4(process.pid, os.WNOHANG)
             if ended:
                 code = os.waitstatus_to_exitcode(status)
                 break
             if again is not None and not sent and time.monotonic() - begun >= again:
-                process.send_signal(number)
+                os.kill(process.pid, number)
                 sent = True
             time.sleep(0.005)
         seconds = time.monotonic() - begun

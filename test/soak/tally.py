@@ -85,7 +85,7 @@ def finish(*command: object, folder: Path, limit: float = 60.0, environment: dic
 
         def kill() -> None:
             killed.set()
-            process.send_signal(signal.SIGKILL)
+            os.kill(process.pid, signal.SIGKILL)  # unlike send_signal, this never waits for the process
 
         clock = threading.Timer(limit, kill)
         clock.start()
