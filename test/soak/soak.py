@@ -36,6 +36,12 @@ CAMPAIGNS: tuple[str, ...] = (
     'resume',
     'scenes',
 )
+TITLE = """# Hostile input and injected faults
+
+`make soak`. Refused: ended in one sentence, or was counted as dropped, or ended before there was a result.
+Lost and died: what should not happen, as the modules in `test/soak` say. Silence: the longest time without an
+answer, or until a command ended.
+"""
 HEAD = ('campaign', 'tried', 'refused', 'lost', 'died', 'peak memory', 'longest silence', 'minutes')
 
 
@@ -46,6 +52,7 @@ def main() -> int:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--amount', type=int, help='how much each campaign tries; default: its own FULL')
     chosen = parser.parse_args()
+    print(TITLE)
     print('\n'.join(f'| {" | ".join(row)} |' for row in (HEAD, ('---',) * len(HEAD))), flush=True)
     bad = False
     for name in chosen.campaign:
