@@ -114,6 +114,8 @@ def interrupted(command: list[str], folder: Path, number: int, delay: float, aga
             start_new_session=True, env={**os.environ, **graph})
         time.sleep(delay)
         early = not handles(process.pid)
+        if early:  # a signal before Python has begun can be lost
+            again = 1.0
         begun, sent, code, usage = time.monotonic(), False, None, None
         os.kill(process.pid, number)  # unlike send_signal, this never waits for the process
         while time.monotonic() - begun < PATIENCE:
