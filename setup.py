@@ -47,6 +47,8 @@ setup(
         'mcap>=1.6',
         'numba>=0.58',
         'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'pillow>=9.4',
         'pybullet>=3.2.5',
         'rich>=13.7',
         'rosbags>=0.11',

@@ -26,6 +26,8 @@ SHARED = ('errors', 'signals', 'writing')
 ONLY = {
     'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
     'pybullet': ('simulation/bullet.py',),
+    'cv2': ('capture',),
+    'PIL': ('capture',),
     'numba': ('simulation/kernels.py',),
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
@@ -34,7 +36,8 @@ ONLY = {
     'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
-NOT_LOADED = ('jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib', 'scipy.optimize', 'cma')
+NOT_LOADED = ('cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib',
+              'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))
 

@@ -24,6 +24,8 @@ EXECUTABLES = ('calibrator', 'dlo-calibration')
 
 #: Import name of a Python library -> its rosdep key, where that is not python3-<name>.
 ROSDEP_KEYS = {
+    'PIL': 'python3-pil',
+    'cv2': 'python3-opencv',
     'lz4': 'mcap-ros2-support',  # by way of mcap, which needs it
     'mcap': 'mcap-ros2-support',
     'pybullet': 'python3-pybullet-pip',

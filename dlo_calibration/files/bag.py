@@ -5,22 +5,10 @@
 
 from __future__ import annotations
 
-from itertools import islice
 import json
 from pathlib import Path, PurePath
 import tempfile
-from typing import Any, Iterable, Iterator, Mapping
-
-from ruamel.yaml import YAML
-from ruamel.yaml.events import (
-    AliasEvent,
-    DocumentStartEvent,
-    Event,
-    MappingStartEvent,
-    ScalarEvent,
-    SequenceStartEvent,
-    StreamStartEvent,
-)
+from typing import Any, Iterable, Mapping
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.intake import Intake, LimitExceeded, Record, require_file
@@ -28,13 +16,12 @@ from dlo_calibration.files.mcap_file import McapFile
 from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, typestore
 from dlo_calibration.files.sqlite_file import read_sqlite
 from dlo_calibration.files.unpacking import unpack_file
+from dlo_calibration.files.yaml import read_first
 from dlo_calibration.messages.codec import INPUT_TYPES
 
 SUFFIXES = ('.mcap', '.db3', '.zstd')  # of recordings in a folder
 EXPECTED = 'an MCAP file or a rosbag2 folder'
 METADATA_SIZE = 10**6  # bytes; a recording of a hundred topics in a thousand files has a third
-METADATA_EVENTS = 50_000  # of the YAML parser: three seconds
-METADATA_DEPTH = 20  # rosbag2 needs 6
 OPTIONS_SIZE = 10**5  # characters of recorded options; ours have 2000
 
 
@@ -240,29 +227,8 @@ def _recordings(file: Path) -> list[str]:
         octets = stream.read(METADATA_SIZE + 1)
     if len(octets) > METADATA_SIZE:
         raise ValueError('too large')
-    if b'\0' in octets:
-        raise ValueError('no text')
-    events = islice(YAML(typ='safe', pure=True).parse(octets.decode('utf-8')), METADATA_EVENTS)
-    whole = _plain(event for event in events if not isinstance(event, (StreamStartEvent, DocumentStartEvent)))
+    whole = read_first(octets)
     names = whole[METADATA_KEY].get('relative_file_paths') or []
     if not isinstance(names, list):
         raise ValueError('no list of files')
     return [PurePath(name).name for name in names]
-
-
-def _plain(events: Iterator[Event], depth: int = 0) -> Any:
-    """
-    Return the value that comes next: text, a list or a dict; None for the end of a list or a dict.
-
-    :raises Exception: of any kind, where the events end, and for aliases, as a few make millions of values.
-    """
-    event = next(events)
-    if isinstance(event, AliasEvent) or depth > METADATA_DEPTH:
-        raise ValueError('an alias, or values nested too deep')
-    if isinstance(event, ScalarEvent):
-        return event.value
-    if isinstance(event, SequenceStartEvent):
-        return list(iter(lambda: _plain(events, depth + 1), None))
-    if isinstance(event, MappingStartEvent):
-        return {key: _plain(events, depth + 1) for key in iter(lambda: _plain(events, depth + 1), None)}
-    return None

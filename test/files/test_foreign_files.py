@@ -14,7 +14,7 @@ import zstandard
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files import bag, intake
+from dlo_calibration.files import intake, yaml
 from dlo_calibration.files import session as session_module
 from dlo_calibration.files.bag import encode
 from dlo_calibration.files.recording import OUR_RECORD, SessionWriter
@@ -150,7 +150,7 @@ def test_metadata_that_is_no_rosbag2s_is_left_out(folder, text):
 
 
 def test_metadata_with_more_events_than_the_limit_is_left_out(folder, monkeypatch):
-    monkeypatch.setattr(bag, 'METADATA_EVENTS', 50)
+    monkeypatch.setattr(yaml, 'MAXIMUM_EVENTS', 50)
     found = read_session(folder)
     assert len(found.messages) == len(GOOD)
     assert any('metadata.yaml cannot be read' in problem for problem in found.problems)

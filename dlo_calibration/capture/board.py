@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Board: a ChArUco board, which is printed, laid beside the DLO, and found in the photograph.
+
+Its frame: the origin is the lower left corner of the squares, x goes along the paper's short side to the
+right, y along the long side upwards, z up from the paper.  Of OpenCV, only the markers and their corners
+are used: the order of a board's corners, its origin and its colours changed from one version to another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import itertools
+from typing import Any, Mapping
+
+import cv2
+import numpy as np
+
+from dlo_calibration.capture.photograph import Pixels
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats
+
+COLUMNS, ROWS = 7, 9  # squares; those in the corners are black
+SQUARE, MARKER = 0.025, 0.0175  # m, sides
+RULER = 0.1  # m, length of the printed line that shows whether the printer changed the size
+CELLS = 6  # of a marker's side: 4 bits and a border
+MARKERS = COLUMNS * ROWS // 2  # one in each white square
+FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it lies
+REDUCED = 1600  # px, of the longer side, for the first look for markers
+
+_ARUCO: Any = cv2.aruco  # of any version
+
+
+@dataclass(frozen=True)
+class Paper:
+    """
+    A size of paper.
+
+    :param width: and `height`, upright [m].
+    :param first: number of the first marker; the sizes have different ones, and so are told apart.
+    """
+
+    name: str
+    width: float
+    height: float
+    first: int
+
+
+PAPERS: Mapping[str, Paper] = {'a4': Paper('A4', 0.210, 0.297, 0),
+                               'letter': Paper('Letter', 0.2159, 0.2794, MARKERS)}
+
+
+def marker_squares() -> list[tuple[int, int]]:
+    """Return column and row, from the upper left, of each square with a marker, in the markers' order."""
+    places = itertools.product(range(ROWS), range(COLUMNS))
+    return [(column, row) for row, column in places if (column + row) % 2]
+
+
+def marker_cells(number: int) -> Pixels:
+    """Return the cells (6, 6) of a marker, 0 black and 255 white."""
+    draw = _ARUCO.generateImageMarker if hasattr(_ARUCO, 'generateImageMarker') else _ARUCO.drawMarker
+    cells: Pixels = draw(_dictionary(), number, CELLS)
+    return cells
+
+
+def find_board(pixels: Pixels, paper: str | None = None, printed: float = RULER) -> tuple[Floats, Floats]:
+    """
+    Return the corners of the board's squares in a photograph: (k, 2) pixels, and (k, 2) in its frame [m].
+
+    :param pixels: (h, w, 3) red, green, blue of the photograph.
+    :param paper: `a4` or `letter`, if only that is wanted.
+    :param printed: length of the board's ruler line, as measured on the print [m].
+    :raises InputError: where too little of it is seen.
+    """
+    if not 0.5 * RULER <= printed <= 2.0 * RULER:
+        raise InputError('length of the ruler line', f'{printed:g} m',
+                         f'{0.5 * RULER:g} m to {2.0 * RULER:g} m', 'measure it in metres')
+    wanted = PAPERS if paper is None else {paper: PAPERS[paper]}
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    most = 0
+    for longest in dict.fromkeys((min(REDUCED, max(grey.shape)), max(grey.shape))):
+        found = _markers(grey, longest)
+        for one in wanted.values():
+            seen, places = _corners(grey, {number - one.first: marker for number, marker in found.items()
+                                           if 0 <= number - one.first < MARKERS})
+            most = max(most, len(seen))
+            if len(seen) >= FEWEST_CORNERS and np.linalg.matrix_rank(places - places[0], SQUARE / 2.0) == 2:
+                return seen, places * (printed / RULER)
+    raise InputError('board', f'{most} of its {(COLUMNS - 1) * (ROWS - 1)} corners',
+                     f'at least {FEWEST_CORNERS}, seen sharply and without a reflection',
+                     'lay it flat beside the DLO, wholly in the picture, and take the photograph from nearer')
+
+
+def _dictionary() -> Any:
+    """Return the predefined dictionary of markers, which OpenCV before and after 4.7 both know."""
+    return _ARUCO.getPredefinedDictionary(_ARUCO.DICT_4X4_100)
+
+
+def _detected(grey: Pixels) -> tuple[Any, Any]:
+    """Return the corners and numbers of markers, by the interface that OpenCV has: another one since 4.7."""
+    if hasattr(_ARUCO, 'ArucoDetector'):
+        corners, numbers, _ = _ARUCO.ArucoDetector(_dictionary()).detectMarkers(grey)
+    else:
+        corners, numbers, _ = _ARUCO.detectMarkers(grey, _dictionary())
+    return corners, numbers
+
+
+def _markers(grey: Pixels, longest: int) -> dict[int, Floats]:
+    """Return the corners (4, 2) [px] of each marker, found in the picture reduced to a longer side [px]."""
+    scale = longest / max(grey.shape)
+    height, width = (round(scale * side) for side in grey.shape)
+    small = grey if scale == 1.0 else cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    corners, numbers = _detected(small)
+    if numbers is None:
+        return {}
+    back = np.array([grey.shape[1] / width, grey.shape[0] / height])
+    found: dict[int, Floats] = {}
+    for number, marker in zip(np.ravel(numbers), corners, strict=True):
+        found[int(number)] = (marker.reshape(4, 2).astype(float) + 0.5) * back - 0.5
+    return found
+
+
+def _corners(grey: Pixels, markers: dict[int, Floats]) -> tuple[Floats, Floats]:
+    """
+    Return the corners (k, 2) [px] between black squares, and their places (k, 2) [m].
+
+    Each marker tells where the corners of its square are, also where the lens bends the board. What the
+    markers beside a corner tell is averaged, and then moved to where the edges meet.
+    """
+    markers = _agreeing(markers)
+    inset = (SQUARE - MARKER) / 2.0
+    told: dict[tuple[int, int], list[Floats]] = {}
+    sides: dict[tuple[int, int], list[float]] = {}
+    for number, seen in markers.items():
+        column, row = marker_squares()[number]
+        view = cv2.getPerspectiveTransform(_square(inset, inset, MARKER), seen.astype(np.float32))
+        corners = cv2.perspectiveTransform(_square(0.0, 0.0, SQUARE)[:, None], view).reshape(4, 2)
+        side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min())
+        for corner, (right, down) in zip(corners, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
+            place = column + right, row + down
+            if 0 < place[0] < COLUMNS and 0 < place[1] < ROWS:
+                told.setdefault(place, []).append(corner)
+                sides.setdefault(place, []).append(side)
+    found, places = [], []
+    for place in sorted(told):
+        side = min(sides[place])
+        corner = _met(grey, np.mean(told[place], axis=0), side)
+        if corner is not None and np.ptp(told[place], axis=0).max() < 0.2 * side:
+            found.append(corner)
+            places.append((place[0] * SQUARE, (ROWS - place[1]) * SQUARE))
+    return np.array(found).reshape(-1, 2), np.array(places).reshape(-1, 2)
+
+
+def _agreeing(markers: dict[int, Floats]) -> dict[int, Floats]:
+    """Return the markers that lie together as on the board; others were read from something else."""
+    if len(markers) < 3:
+        return {}
+    squares = np.array([marker_squares()[number] for number in markers], float)
+    middles = np.array([seen.mean(axis=0) for seen in markers.values()])
+    side = float(np.median([np.linalg.norm(seen[0] - seen[2]) for seen in markers.values()]))
+    plane = (cv2.estimateAffine2D(squares, middles, ransacReprojThreshold=side) if len(markers) == 3 else
+             cv2.findHomography(squares, middles, cv2.RANSAC, side / 2.0))
+    if plane[0] is None:
+        return {}
+    kept = plane[1].ravel().astype(bool)
+    return {number: seen for (number, seen), keep in zip(markers.items(), kept, strict=True) if keep}
+
+
+def _met(grey: Pixels, corner: Floats, side: float) -> Floats | None:
+    """Return where black squares with some `side` [px] meet near a pixel (2,), or None."""
+    half = max(round(0.12 * side), 2)  # the markers' corners stay outside
+    height, width = grey.shape
+    if not (half + 2 < corner[0] < width - half - 3 and half + 2 < corner[1] < height - half - 3):
+        return None
+    left, top = (int(one) - 2 * half - 4 for one in corner)
+    left, top = max(left, 0), max(top, 0)
+    piece = np.ascontiguousarray(grey[top:top + 4 * half + 9, left:left + 4 * half + 9])
+    start = (corner - (left, top)).astype(np.float32).reshape(1, 1, 2)
+    ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.005)
+    met: Floats = cv2.cornerSubPix(piece, start.copy(), (half, half), (-1, -1), ends).reshape(2) + (left, top)
+    return met if np.linalg.norm(met - corner) < max(half, 3.0) else None
+
+
+def _square(left: float, top: float, side: float) -> Any:
+    """Return the corners (4, 2) of a square, clockwise from the upper left."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * side + (left, top)
+    return corners.astype(np.float32)

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Scale: where on the table, or above it, what a pixel shows is.
+
+The table is the plane z = 0 of the trial's frame: x and y lie on it, z points up, and seen from above
+y is x turned anticlockwise.  The frame of the camera is OpenCV's: x to the right, y down, z into the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dlo_calibration.capture.camera import Lens
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats, frozen_array
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """
+    A camera and where it stood, as points on the table told.
+
+    :param lens: of the camera, for the size of the photograph.
+    :param rotation: (3, 3) from the table's frame to the camera's.
+    :param translation: (3,) the table's origin in the camera's frame [m].
+    :param residuals: (k,) distance on the table between each given point and where its pixel is [m].
+    :param focal_length_known: False: neither a calibration nor the photograph's file told it.
+    :param notes: sentences for the user: what was assumed, and what that may cost.
+    :param covariance: (p, p) of `parameters`, of which the first p are uncertain.
+    """
+
+    lens: Lens
+    rotation: Floats
+    translation: Floats
+    residuals: Floats
+    focal_length_known: bool
+    notes: tuple[str, ...] = ()
+    covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        for name in ('rotation', 'translation', 'residuals', 'covariance'):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photograph [px]."""
+        return self.lens.size
+
+    @property
+    def residual(self) -> float:
+        """Root mean square of the residuals [m]."""
+        return math.sqrt(float(np.square(self.residuals).mean()))
+
+    @property
+    def camera(self) -> Floats:
+        """Place of the camera (3,) in the table's frame [m]."""
+        place: Floats = -self.rotation.T @ self.translation
+        return place
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the direction in which the camera looks and straight down [rad]."""
+        return math.acos(min(max(-float(self.rotation[2, 2]), -1.0), 1.0))
+
+    def to_table(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> Floats:
+        """
+        Return the points (n, 3) [m] that pixels (n, 2) show, if they are at some height above the table.
+
+        :param height: of all points, or (n,) of each [m].  A DLO on the table has its middle at its radius.
+        :raises InputError: where a pixel shows no such point, as it is above the horizon.
+        """
+        seen = np.asarray(pixels, float).reshape(-1, 2)
+        points = self.points(seen, height)
+        bad = np.flatnonzero(np.isnan(points).any(axis=1))
+        if len(bad):
+            u, v = seen[bad[0]]
+            raise InputError(f'pixel {u:.0f},{v:.0f}', 'a place above the horizon of the table, by the scale',
+                             'a place on the table', 'check the points of the scale')
+        return points
+
+    def points(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> Floats:
+        """Do what `to_table` does, with points that are not a number for pixels above the horizon."""
+        ideal = self.lens.undistorted(pixels)
+        directions = np.linalg.inv(self.lens.matrix).T @ self.rotation
+        rays = np.column_stack([ideal, np.ones(len(ideal))]) @ directions
+        camera = self.camera
+        height = np.broadcast_to(np.asarray(height, float), len(rays))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            distance = (height - camera[2]) / rays[:, 2]
+            points: Floats = camera + distance[:, None] * rays
+        points[:, 2] = height
+        points[~(distance > 0.0)] = np.nan
+        return points
+
+    def to_pixels(self, points: ArrayLike) -> Floats:
+        """Return the pixels (n, 2) that show points (n, 3) [m]; not a number for those behind the camera."""
+        seen = np.asarray(points, float).reshape(-1, 3) @ self.rotation.T + self.translation
+        before = seen[:, 2] > 1e-6  # m
+        ideal = (seen[before] / seen[before, 2:]) @ self.lens.matrix[:2].T
+        pixels = np.full((len(seen), 2), np.nan)
+        pixels[before] = self.lens.distorted(ideal)
+        return pixels
+
+    def to_axis(self, pixels: ArrayLike, radius: float, height: ArrayLike | None = None) -> Floats:
+        """
+        Return the axis (n, 3) [m] of a round DLO whose visible middle is the line of pixels (n, 2).
+
+        The planes that touch a tube and hold the camera make equal angles with the plane through its axis.
+        Equal angles are not equal distances in a picture, so the middle between the tube's edges is not quite
+        where its axis is.  The difference, (radius / distance)^2 tan(a) / cos(a)^2 focal lengths at an angle
+        a from the optical axis, is taken away here: 0.1 mm for 20 mm thickness, 0.8 m away, near a corner.
+
+        :param height: of the axis above the table, for all points or (n,) [m]; None: `radius`, it lies there.
+        """
+        seen = np.asarray(pixels, float).reshape(-1, 2)
+        height = radius if height is None else height
+        axis = self.to_table(seen, height)
+        if len(axis) < 2 or radius <= 0.0:
+            return axis
+        along = _unit(np.gradient(axis, axis=0))
+        sight = self.camera - axis
+        sight -= (sight * along).sum(axis=1, keepdims=True) * along
+        distance = np.linalg.norm(sight, axis=1, keepdims=True)
+        sight /= distance
+        # Where the planes touch the tube, in the cross-section through each point (n, 3).
+        sine = np.minimum(radius / distance, 1.0)
+        aside = np.cross(along, sight) * np.sqrt(1.0 - sine**2)
+        edges = [self.to_pixels(axis + radius * (sine * sight + side * aside)) for side in (-1.0, 1.0)]
+        shift = (edges[0] + edges[1]) / 2.0 - seen
+        ahead = _unit(np.gradient(seen, axis=0))
+        across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        return self.to_table(seen - (shift * across).sum(axis=1, keepdims=True) * across, height)
+
+    def metres_per_pixel(self, pixels: ArrayLike) -> Floats:
+        """Return the side (n,) of a square on the table with the area of each pixel (n, 2) [m]."""
+        seen = np.asarray(pixels, float).reshape(-1, 2)
+        right, down = (self.points(seen + step) - self.points(seen - step) for step in np.eye(2) / 2.0)
+        return np.sqrt(np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0]))
+
+    @property
+    def parameters(self) -> Floats:
+        """Rotation vector (3), translation (3) [m], logarithm of the focal length [px], first coefficient."""
+        first = self.lens.coefficients[0] if len(self.lens.coefficients) else 0.0
+        return np.concatenate([cv2.Rodrigues(self.rotation)[0].ravel(), self.translation,
+                               [math.log(self.lens.matrix[0, 0]), first]])
+
+    def uncertainty(self, pixels: ArrayLike, height: float = 0.0, above: float | None = None) -> Floats:
+        """
+        Return the standard deviation (n,) of the places that `to_table` finds [m].
+
+        :param above: of the difference between the places at `height` and at this height instead.
+        """
+        changes = []
+        deviations = np.sqrt(np.diag(self.covariance))
+        for column, deviation in enumerate(deviations):
+            sides = []
+            for sign in (-1.0, 1.0):
+                values = self.parameters
+                values[column] += sign * deviation / 10.0
+                moved = self.with_parameters(values)
+                points = moved.points(pixels, height)
+                sides.append(points - moved.points(pixels, above) if above is not None else points)
+            changes.append((sides[1] - sides[0]) * 5.0)
+        if not changes:
+            return np.zeros(len(np.asarray(pixels, float).reshape(-1, 2)))
+        scaled = np.stack(changes)[..., :2]  # (p, n, 2), for a change of one deviation
+        correlation = self.covariance / np.outer(deviations, deviations)
+        variance: Floats = np.einsum('pnk,pq,qnk->n', scaled, correlation, scaled)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    def with_parameters(self, values: Floats) -> Scale:
+        """Return the scale with other `parameters` (8,)."""
+        matrix = self.lens.matrix.copy()
+        matrix[:2, :2] *= math.exp(values[6]) / matrix[0, 0]
+        coefficients = self.lens.coefficients.copy()
+        coefficients[:1] = values[7]
+        return replace(self, lens=replace(self.lens, matrix=matrix, coefficients=coefficients),
+                       rotation=cv2.Rodrigues(np.ascontiguousarray(values[:3]))[0], translation=values[3:6])
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Return vectors (n, k) with length 1, and those without length unchanged."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    units: Floats = vectors / np.where(length > 0.0, length, 1.0)
+    return units
