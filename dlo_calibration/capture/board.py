@@ -28,7 +28,9 @@ RULER = 0.1  # m, length of the printed line that shows whether the printer chan
 CELLS = 6  # of a marker's side: 4 bits and a border
 MARKERS = COLUMNS * ROWS // 2  # one in each white square
 FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it lies
+ENOUGH_CORNERS = 36  # with which no closer look is needed
 REDUCED = 1600  # px, of the longer side, for the first look for markers
+SMALLEST = 0.01  # perimeter of a marker, of the picture's longer side; OpenCV itself takes 0.03
 
 _ARUCO: Any = cv2.aruco  # of any version
 
@@ -79,16 +81,19 @@ def find_board(pixels: Pixels, paper: str | None = None, printed: float = RULER)
                          f'{0.5 * RULER:g} m to {2.0 * RULER:g} m', 'measure it in metres')
     wanted = PAPERS if paper is None else {paper: PAPERS[paper]}
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    most = 0
+    best = np.zeros((0, 2)), np.zeros((0, 2))
     for longest in dict.fromkeys((min(REDUCED, max(grey.shape)), max(grey.shape))):
         found = _markers(grey, longest)
         for one in wanted.values():
             seen, places = _corners(grey, {number - one.first: marker for number, marker in found.items()
                                            if 0 <= number - one.first < MARKERS})
-            most = max(most, len(seen))
-            if len(seen) >= FEWEST_CORNERS and np.linalg.matrix_rank(places - places[0], SQUARE / 2.0) == 2:
-                return seen, places * (printed / RULER)
-    raise InputError('board', f'{most} of its {(COLUMNS - 1) * (ROWS - 1)} corners',
+            best = max(best, (seen, places), key=lambda corners: len(corners[0]))
+        if len(best[0]) >= ENOUGH_CORNERS:
+            break
+    seen, places = best
+    if len(seen) >= FEWEST_CORNERS and np.linalg.matrix_rank(places - places[0], SQUARE / 2.0) == 2:
+        return seen, places * (printed / RULER)
+    raise InputError('board', f'{len(seen)} of its {(COLUMNS - 1) * (ROWS - 1)} corners',
                      f'at least {FEWEST_CORNERS}, seen sharply and without a reflection',
                      'lay it flat beside the DLO, wholly in the picture, and take the photograph from nearer')
 
@@ -100,10 +105,13 @@ def _dictionary() -> Any:
 
 def _detected(grey: Pixels) -> tuple[Any, Any]:
     """Return the corners and numbers of markers, by the interface that OpenCV has: another one since 4.7."""
-    if hasattr(_ARUCO, 'ArucoDetector'):
-        corners, numbers, _ = _ARUCO.ArucoDetector(_dictionary()).detectMarkers(grey)
+    new = hasattr(_ARUCO, 'ArucoDetector')
+    options = _ARUCO.DetectorParameters() if new else _ARUCO.DetectorParameters_create()
+    options.minMarkerPerimeterRate = SMALLEST
+    if new:
+        corners, numbers, _ = _ARUCO.ArucoDetector(_dictionary(), options).detectMarkers(grey)
     else:
-        corners, numbers, _ = _ARUCO.detectMarkers(grey, _dictionary())
+        corners, numbers, _ = _ARUCO.detectMarkers(grey, _dictionary(), parameters=options)
     return corners, numbers
 
 
@@ -150,7 +158,19 @@ def _corners(grey: Pixels, markers: dict[int, Floats]) -> tuple[Floats, Floats]:
         if corner is not None and np.ptp(told[place], axis=0).max() < 0.2 * side:
             found.append(corner)
             places.append((place[0] * SQUARE, (ROWS - place[1]) * SQUARE))
-    return np.array(found).reshape(-1, 2), np.array(places).reshape(-1, 2)
+    return _smooth(np.array(found).reshape(-1, 2), np.array(places).reshape(-1, 2))
+
+
+def _smooth(corners: Floats, places: Floats) -> tuple[Floats, Floats]:
+    """Return corners (k, 2) [px] and places (k, 2) [m] without those that something covers in part."""
+    if len(corners) < FEWEST_CORNERS:
+        return corners, places
+    view, _ = cv2.findHomography(places, corners, cv2.LMEDS)
+    if view is None:
+        return corners[:0], places[:0]
+    apart = np.linalg.norm(cv2.perspectiveTransform(places[:, None], view)[:, 0] - corners, axis=1)
+    kept = apart <= max(6.0 * float(np.median(apart)), 1.0)  # a lens that bends the board stays below
+    return corners[kept], places[kept]
 
 
 def _agreeing(markers: dict[int, Floats]) -> dict[int, Floats]:

@@ -34,7 +34,7 @@ ORDINARY_LENGTH = 26.0  # mm
 #: Standard deviations of the focal length's logarithm.  Exif's has whole millimetres, and the picture may
 #: have been stabilised or corrected, which cuts some per cent of it.
 DEVIATION_ORDINARY, DEVIATION_FILE = 0.25, 0.03
-DEVIATION_DISTORTION = 0.02  # of the first radial coefficient, in what cameras make of their pictures
+DEVIATION_DISTORTION = 0.05  # of the first radial coefficient; cameras correct most of it
 MARKING = 0.0005  # of the picture's longer side: deviation of a person's marks, 2 px of 4000
 MARKS = 2.0  # that the above counts for, beside what the residuals of many points tell
 MOST_RESIDUAL = 0.01  # of the points' extent; beyond it, something is wrong
@@ -156,7 +156,7 @@ class _Problem:
         """Search from parameters (p,), where the pixels have some standard deviation [px]."""
         solution = least_squares(
             lambda values: self._weighted(self._errors(values) / deviation, values), start,
-            jac=lambda values: self._slopes(values, deviation), x_scale='jac', max_nfev=100)
+            jac=lambda values: self._slopes(values, deviation), method='lm', x_scale='jac', max_nfev=200)
         values: Floats = solution.x
         slopes = self._slopes(values, deviation)
         scale = Scale(self.lens_of(values), cv2.Rodrigues(np.ascontiguousarray(values[:3]))[0], values[3:6],
