@@ -28,6 +28,7 @@ RULER = 0.1  # m, length of the printed line that shows whether the printer chan
 CELLS = 6  # of a marker's side: 4 bits and a border
 MARKERS = COLUMNS * ROWS // 2  # one in each white square
 FEWEST_CORNERS = 8  # of 48: a third of the sheet, which still determines how it lies
+FEWEST_MARKERS = 3
 ENOUGH_CORNERS = 36  # with which no closer look is needed
 REDUCED = 1600  # px, of the longer side, for the first look for markers
 SMALLEST = 0.01  # perimeter of a marker, of the picture's longer side; OpenCV itself takes 0.03
@@ -169,28 +170,32 @@ def _smooth(corners: Floats, places: Floats) -> tuple[Floats, Floats]:
     if view is None:
         return corners[:0], places[:0]
     apart = np.linalg.norm(cv2.perspectiveTransform(places[:, None], view)[:, 0] - corners, axis=1)
-    kept = apart <= max(6.0 * float(np.median(apart)), 1.0)  # a lens that bends the board stays below
+    kept = apart <= max(4.0 * float(np.median(apart)), 0.6)  # a lens that bends the board stays below
     return corners[kept], places[kept]
 
 
 def _agreeing(markers: dict[int, Floats]) -> dict[int, Floats]:
     """Return the markers that lie together as on the board; others were read from something else."""
-    if len(markers) < 3:
+    if len(markers) < FEWEST_MARKERS:
         return {}
-    squares = np.array([marker_squares()[number] for number in markers], float)
-    middles = np.array([seen.mean(axis=0) for seen in markers.values()])
-    side = float(np.median([np.linalg.norm(seen[0] - seen[2]) for seen in markers.values()]))
-    plane = (cv2.estimateAffine2D(squares, middles, ransacReprojThreshold=side) if len(markers) == 3 else
-             cv2.findHomography(squares, middles, cv2.RANSAC, side / 2.0))
-    if plane[0] is None:
+    inset = (SQUARE - MARKER) / 2.0
+    places = np.concatenate([_square(column * SQUARE + inset, row * SQUARE + inset, MARKER)
+                             for column, row in (marker_squares()[number] for number in markers)])
+    seen = np.concatenate(list(markers.values()))
+    side = float(np.median([np.linalg.norm(marker[0] - marker[1]) for marker in markers.values()]))
+    _, near = cv2.findHomography(places, seen, cv2.RANSAC, 0.25 * side)  # a lens may bend the board
+    if near is None:
         return {}
-    kept = plane[1].ravel().astype(bool)
-    return {number: seen for (number, seen), keep in zip(markers.items(), kept, strict=True) if keep}
+    # All four corners: those of a marker that was read from something else lie elsewhere, or are turned.
+    kept = near.reshape(-1, 4).all(axis=1)
+    if kept.sum() < FEWEST_MARKERS:
+        return {}
+    return {number: marker for (number, marker), keep in zip(markers.items(), kept, strict=True) if keep}
 
 
 def _met(grey: Pixels, corner: Floats, side: float) -> Floats | None:
     """Return where black squares with some `side` [px] meet near a pixel (2,), or None."""
-    half = max(round(0.12 * side), 2)  # the markers' corners stay outside
+    half = max(round(0.12 * side), 3)  # the markers' corners stay outside
     height, width = grey.shape
     if not (half + 2 < corner[0] < width - half - 3 and half + 2 < corner[1] < height - half - 3):
         return None

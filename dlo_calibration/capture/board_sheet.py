@@ -36,6 +36,13 @@ def write_board(path: Path, paper: str = 'a4') -> None:
 
     :raises InputError: where the file cannot be written.
     """
+    with whole(path) as new:
+        board_figure(paper).savefig(new, format='pdf', metadata={
+            'CreationDate': None, 'Title': f'Board for {PAPERS[paper].name}'})
+
+
+def board_figure(paper: str = 'a4') -> Any:
+    """Return the board as a figure of Matplotlib, with the size of the paper."""
     from matplotlib.figure import Figure
 
     sheet = PAPERS[paper]
@@ -47,8 +54,7 @@ def write_board(path: Path, paper: str = 'a4') -> None:
     _draw_squares(axes, sheet, left, BOTTOM)
     _draw_frame(axes, left, BOTTOM)
     _draw_ruler(axes, sheet)
-    with whole(path) as new:
-        figure.savefig(new, format='pdf', metadata={'CreationDate': None, 'Title': f'Board for {sheet.name}'})
+    return figure
 
 
 def _draw_squares(axes: Any, sheet: Paper, left: float, bottom: float) -> None:

@@ -58,6 +58,9 @@ def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int]
     marked, places = check_points(pixels, table, size, thing)
     lens = None if lens is None else lens.fitted(size, 'camera calibration')
     problem = _Problem(marked, places, size, lens, focal_length)
+    for row in np.flatnonzero(np.isnan(problem.ideal).any(axis=1)):
+        raise InputError(f'{thing}, point {row + 1}', 'a pixel so far outside that its direction is unknown',
+                         'one that the camera calibration covers', 'mark a point nearer to the middle')
     check_sides(problem.ideal, places, thing, lambda: _exchanged(problem))
     fit = problem.fit()
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
@@ -150,7 +153,7 @@ class _Problem:
             for turn, shift in zip(found[1], found[2], strict=True):
                 start = np.concatenate([turn.ravel(), shift.ravel(), [math.log(length), 0.0]])
                 starts.append(start if self.lens is None else start[:6])
-        return starts
+        return [start for start in starts if np.isfinite(start).all()]  # seen from above, there is one
 
     def _refined(self, start: Floats, deviation: float) -> _Fit:
         """Search from parameters (p,), where the pixels have some standard deviation [px]."""
@@ -236,11 +239,11 @@ def _notes(scale: Scale, count: int) -> list[str]:
         where = 'found from the points' if found else 'that of an ordinary telephone'
         notes.append(f'The focal length is not in the photograph: {film:.0f} mm of 35 mm film, give or take '
                      f'{100 * deviation:.0f} %, is {where}.')
-    middle = np.array([[(scale.size[0] - 1) / 2.0, (scale.size[1] - 1) / 2.0]])
-    error = float(scale.uncertainty(middle, HEIGHT, above=0.0)[0])
+    quarters = np.array(list(itertools.product((0.25, 0.75), repeat=2))) * scale.size
+    error = float(np.median(scale.uncertainty(quarters, HEIGHT, above=0.0)))
     if not error <= WORTH_TELLING:
-        notes.append(f'In the middle of the picture, a point {1e3 * HEIGHT:.0f} mm above the table is placed '
-                     f'to {1e3 * error:.1f} mm: look straight down, or calibrate the camera.')
+        notes.append(f'A point {1e3 * HEIGHT:.0f} mm above the table is placed to {1e3 * error:.1f} mm: '
+                     'calibrate the camera if that is too much.')
     if count == 4:
         notes.append('Four points fit nearly always, even if one is wrong: look at the grid, or mark five.')
     return notes
