@@ -14,9 +14,10 @@ from dlo_calibration.capture.scale import Scale
 from dlo_calibration.model.chain import Floats, frozen_array
 
 SPACINGS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # m
-LINES = 12  # in each direction, about as many as can be told apart
+LINES = 12  # across the longer side of the picture; as many can be told apart
 FARTHEST = 3.0  # heights of the camera, from the point below it: beyond, a table is hardly seen
-SAMPLES = 400  # of each line
+SAMPLES = 2000  # of each line, which ends at the border with this resolution
+KEPT = 40  # of them, about, as a lens bends lines only a little
 RASTER = 50  # pixels across and down the picture, where the table is looked for
 
 
@@ -45,11 +46,13 @@ class GridLine:
 
 def grid(scale: Scale) -> list[GridLine]:
     """Return the lines of the table that a photograph shows; none if it shows no table."""
-    corners = _seen(scale)
-    if len(corners) < 3:
+    table = _seen(scale)
+    if len(table) < 3:
         return []
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    spacing = next((one for one in SPACINGS if (high - low).max() <= LINES * one), SPACINGS[-1])
+    low, high = table.min(axis=0), table.max(axis=0)
+    middle = np.median(scale.to_pixels(np.column_stack([table, np.zeros(len(table))])), axis=0)
+    wanted = max(scale.size) * float(scale.metres_per_pixel([middle])[0]) / LINES
+    spacing = next((one for one in SPACINGS if one >= wanted), SPACINGS[-1])
     lines = []
     for axis, name in enumerate('xy'):
         along = np.linspace(low[1 - axis], high[1 - axis], SAMPLES)
@@ -80,4 +83,5 @@ def _within(scale: Scale, points: Floats) -> list[Floats]:
     changes = np.flatnonzero(np.diff(inside.astype(int)))
     pieces = np.split(pixels, changes + 1)
     starts = inside[np.concatenate([[0], changes + 1])]
-    return [piece for piece, kept in zip(pieces, starts, strict=True) if kept and len(piece) > 1]
+    return [piece[np.unique(np.linspace(0, len(piece) - 1, KEPT).astype(int))]
+            for piece, kept in zip(pieces, starts, strict=True) if kept and len(piece) > 1]

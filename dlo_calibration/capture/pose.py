@@ -40,6 +40,7 @@ MARKS = 2.0  # that the above counts for, beside what the residuals of many poin
 MOST_RESIDUAL = 0.01  # of the points' extent; beyond it, something is wrong
 HEIGHT = 0.01  # m above the table, for which a note tells what the unknown focal length costs
 WORTH_TELLING = 2e-4  # m
+POOR = 2e-3  # m, a residual that careful marks stay below
 
 
 def scale_from_points(pixels: ArrayLike, table: ArrayLike, size: tuple[int, int], lens: Lens | None = None,
@@ -221,7 +222,7 @@ def _suspicion(problem: _Problem, fit: _Fit) -> str:
     sentence = _exchanged(problem)
     if sentence:
         return sentence
-    if count > 5:  # as many remain as can contradict each other
+    if 5 < count <= 12:  # as many remain as can contradict each other, and it takes no time
         worst = min(range(count), key=lambda row: problem.without([row]).fit().residual)
     else:
         worst = int(np.argmax(fit.residuals))
@@ -242,8 +243,12 @@ def _notes(scale: Scale, count: int) -> list[str]:
     quarters = np.array(list(itertools.product((0.25, 0.75), repeat=2))) * scale.size
     error = float(np.median(scale.uncertainty(quarters, HEIGHT, above=0.0)))
     if not error <= WORTH_TELLING:
-        notes.append(f'A point {1e3 * HEIGHT:.0f} mm above the table is placed to {1e3 * error:.1f} mm: '
-                     'calibrate the camera if that is too much.')
+        notes.append(f'A point {1e3 * HEIGHT:.0f} mm above the table is placed with an error of about '
+                     f'{1e3 * error:.1f} mm: calibrate the camera if that is too much.')
+    if scale.residual > POOR:
+        worst = int(np.argmax(scale.residuals))
+        notes.append(f'The points miss their places by {1e3 * scale.residual:.1f} mm (rms), '
+                     f'point {worst + 1} by {1e3 * scale.residuals[worst]:.1f} mm: mark them again.')
     if count == 4:
         notes.append('Four points fit nearly always, even if one is wrong: look at the grid, or mark five.')
     return notes

@@ -110,6 +110,14 @@ def test_an_unknown_focal_length_cannot_be_found_from_above():
     assert misplaced(scale, overhead(0.0), 0.0).max() < 5e-4
 
 
+def test_a_poor_fit_is_told():
+    camera = overhead(20.0)
+    places = EIGHT.copy()
+    places[6] += (0.006, 0.006)  # m
+    notes = scale_from_points(camera.to_pixels(on_table(EIGHT)), places, SIZE, camera.lens).notes
+    assert any('point 7 by' in note for note in notes)
+
+
 def test_a_calibrated_camera_needs_no_note_about_its_lens():
     camera = overhead(20.0)
     assert found(camera, EIGHT, camera.lens).notes == ()
