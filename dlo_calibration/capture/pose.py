@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import itertools
 import math
-from typing import Sequence
+from typing import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -147,14 +147,14 @@ class _Problem:
         lengths = [math.exp(self._prior[0])]
         if self.lens is None and self.focal_length is None:
             lengths += [factor * lengths[0] for factor in (0.6, 1.7)]
-        points = np.column_stack([self.table, np.zeros(len(self.table))])
+        view, _ = cv2.findHomography(self.table, self.ideal, 0)
         for length in lengths:
             lens = self.lens_of(np.array([0.0] * 6 + [math.log(length), 0.0]))
-            found = cv2.solvePnPGeneric(points, self.ideal, lens.matrix, None, flags=cv2.SOLVEPNP_IPPE)
-            for turn, shift in zip(found[1], found[2], strict=True):
-                start = np.concatenate([turn.ravel(), shift.ravel(), [math.log(length), 0.0]])
+            for rotation, shift in _poses(np.linalg.inv(lens.matrix) @ view, self.table.mean(axis=0)):
+                turn = cv2.Rodrigues(rotation)[0].ravel()
+                start = np.concatenate([turn, shift, [math.log(length), 0.0]])
                 starts.append(start if self.lens is None else start[:6])
-        return [start for start in starts if np.isfinite(start).all()]  # seen from above, there is one
+        return starts
 
     def _refined(self, start: Floats, deviation: float) -> _Fit:
         """Search from parameters (p,), where the pixels have some standard deviation [px]."""
@@ -195,6 +195,30 @@ class _Problem:
         length = (slopes[:, 6] + slopes[:, 7]) * math.exp(values[6])
         wanted = np.column_stack([slopes[:, :6], length, slopes[:, 10]]) / deviation
         return np.concatenate([wanted, np.column_stack([np.zeros((2, 6)), np.diag(1.0 / self._deviations)])])
+
+
+def _poses(view: Floats, middle: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """
+    Give two rotations (3, 3) and translations (3,) [m] of a camera that sees a plane by a homography (3, 3).
+
+    The homography's columns are two axes of the rotation and the translation (Zhang, A flexible new technique
+    for camera calibration, IEEE TPAMI 22(11), 2000).  From afar, a plane that is inclined to the line of
+    sight the other way looks nearly the same (Collins and Bartoli, Infinitesimal plane-based pose estimation,
+    IJCV 109, 2014).
+
+    :param middle: (2,) of the points on the plane [m].
+    """
+    first, second, shift = view.T * math.copysign(1.0, view[2] @ [*middle, 1.0])
+    size = np.linalg.norm(first) + np.linalg.norm(second)
+    left, _, right = np.linalg.svd(np.stack([first, second, 2.0 * np.cross(first, second) / size], axis=1))
+    rotation, shift = left @ right, 2.0 * shift / size
+    yield rotation, shift
+    seen = rotation[:, :2] @ middle + shift
+    inclined = np.cross(rotation[:, 2], -seen / np.linalg.norm(seen))
+    sine = float(np.linalg.norm(inclined))
+    if sine > 1e-3:
+        other = cv2.Rodrigues(inclined * (2.0 * math.asin(min(sine, 1.0)) / sine))[0] @ rotation
+        yield other, seen - other[:, :2] @ middle
 
 
 def _exchanged(problem: _Problem) -> str:

@@ -45,11 +45,12 @@ def refusal(content):
 def exif(orientation=1, film=None, taken=None):
     fields = Image.Exif()
     fields[0x0112] = orientation
-    settings = fields.get_ifd(0x8769)
+    settings = {}
     if film is not None:
         settings[0xA405] = film
     if taken is not None:
         settings[0xA002], settings[0xA003] = taken
+    fields[0x8769] = settings
     return fields
 
 
