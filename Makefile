@@ -8,6 +8,8 @@ SHELL := /bin/bash
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
+# Without bytecode, each of the many processes of a test compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 MEASURED := $(wildcard $(or $(DLO_DATA),../shared/data))
 LINT := test/test_lint.py test/test_copyright.py test/test_architecture.py test/test_packaging.py
 
