@@ -13,7 +13,7 @@ import subprocess
 import sys
 
 from domain import ros_graph, WORKER
-from drawings import leave_out_drawings
+from drawings import leave_out_drawings, leave_out_slices
 from hypothesis import settings
 import pytest
 from serial import serial
@@ -49,6 +49,12 @@ def shared_ros_environment(tmp_path_factory) -> Iterator[Mapping[str, str]]:
 def without_drawings(monkeypatch):
     """Leave the drawings of pages out."""
     leave_out_drawings(monkeypatch.setattr)
+
+
+@pytest.fixture
+def without_slices(monkeypatch):
+    """Leave the slices of pages out."""
+    leave_out_slices(monkeypatch.setattr)
 
 
 @pytest.fixture(params=SOURCES)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -143,14 +144,18 @@ class Chain:
         return float(self.arc_lengths()[-1])
 
     def arc_lengths(self) -> Floats:
-        """Arc length at each point, (n,) [m], from 0."""
-        return self._arc_length_table()[1][::SAMPLES_PER_SEGMENT]
+        """Return the arc length at each point, (n,) [m], from 0; read-only."""
+        return self._places
 
     def resample(self, arc_lengths: ArrayLike) -> Floats:
         """Return the points of the curve, (m, 3) [m], at the given arc lengths, (m,) [m]."""
         parameters, along = self._arc_length_table()
         at = np.interp(np.asarray(arc_lengths, dtype=float), along, parameters)
         return bezier_curve(self._knots(), self.points, at)
+
+    @cached_property
+    def _places(self) -> Floats:
+        return frozen_array(self._arc_length_table()[1][::SAMPLES_PER_SEGMENT])
 
     def _knots(self) -> Floats:
         chords = np.linalg.norm(np.diff(self.points, axis=0), axis=1)

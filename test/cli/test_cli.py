@@ -24,15 +24,17 @@ from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import Deadly, new_toy, ToySimulator
 
 from dlo_calibration import calibrate
+from dlo_calibration.calibration import stages
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
+from dlo_calibration.inference.slices import simulate_slices
 from dlo_calibration.messages.codec import bag_types, INITIAL
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FIT_KEYS = {
     'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',
@@ -126,7 +128,8 @@ def test_fit_for_people_has_both_units_and_says_what_is_not_identifiable(run, se
     assert '\x1b' not in output  # no colours into a pipe
 
 
-def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_path):
+def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_path, monkeypatch):
+    monkeypatch.setattr(stages, 'simulate_slices', simulate_slices)  # the page has its slices here
     folder = tmp_path / 'new' / 'out'
     first = only_json(run('fit', session, '--json', '--output', folder, '--evaluations', 8)[1])
     assert {file.name for file in folder.iterdir()} == {
@@ -312,7 +315,7 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 
 PROGRAM = """
 import pathlib, sys
-from drawings import leave_out_drawings
+from drawings import leave_out_drawings, leave_out_slices
 from toy_simulator import ToySimulator
 from dlo_calibration.cli import main as cli
 from dlo_calibration.report import terminal
@@ -324,6 +327,7 @@ class Bar(terminal.SearchBar):
 
 terminal.SearchBar = Bar
 leave_out_drawings()
+leave_out_slices()
 sys.exit(cli.main(sys.argv[3:], lambda options: ToySimulator(float(sys.argv[1]))))
 """
 
@@ -384,7 +388,12 @@ SCENE = ('<robot name="box"><link name="box"><collision><origin xyz="5 0 0"/><ge
 
 
 def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsys):
-    """The scene is found in the session's folder, from anywhere, and named in the report."""
+    """
+    The scene is found in the session's folder, from anywhere, and named in the report.
+
+    It is simulated as in a worker's process, without one of its own; see `test_apart`.
+    """
+    monkeypatch.setattr('dlo_calibration.calibration.engines.parent_process', object)
     monkeypatch.chdir(tmp_path)
     session = write_session(tmp_path / 'recorded', session_messages(TYPES, 1),
                             {'scene': 'my scene.urdf', 'calibrate': ['flexibility'], 'evaluations': 2,

@@ -23,7 +23,7 @@ from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 TYPES = bag_types()
 DECLARED = list(declarations())

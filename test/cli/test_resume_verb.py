@@ -20,16 +20,10 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FLAGS = ('--calibrate', 'flexibility', 'friction', '--evaluations', '25', '--seed', '3')
 FINISHED = {fit.RESULT, fit.SESSION, fit.REPORT, fit.EVALUATIONS}
-
-
-@pytest.fixture(autouse=True)
-def without_slices(monkeypatch):
-    """Leave the slices of the report out: they take as long as they may."""
-    monkeypatch.setattr(fit, 'sliced', lambda *_: None)
 
 
 @pytest.fixture

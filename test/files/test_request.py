@@ -43,7 +43,7 @@ from dlo_calibration.model.named_actions import (
     TwoHands,
 )
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples' / 'xml'
 REQUESTS = sorted(file for file in SAMPLES.glob('*.xml') if 'calibration_request' in file.read_text(

@@ -25,7 +25,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
 DOCUMENTS = ('README.md', 'make_yaml.py', 'make_xml.py')

@@ -25,7 +25,7 @@ from dlo_calibration.files import recording
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INITIAL
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)

@@ -26,7 +26,7 @@ from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FILES = bag_types()
 GOOD = session_messages(FILES, 2)

@@ -34,7 +34,7 @@ from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.ros.calibrator_node import CalibratorNode, spin
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.quantity import number
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 @pytest.fixture
 def start(tmp_path):

@@ -15,7 +15,7 @@ import resource
 import time
 from typing import Iterator
 
-from drawings import leave_out_drawings
+from drawings import leave_out_drawings, leave_out_slices
 from mcap.writer import CompressionType, Writer
 import pytest
 from rosbags.rosbag2 import StoragePlugin
@@ -71,6 +71,7 @@ def quiet() -> Iterator[None]:
     """Leave the drawings of pages out."""
     with pytest.MonkeyPatch.context() as patch:
         leave_out_drawings(patch.setattr)
+        leave_out_slices(patch.setattr)
         yield
 
 

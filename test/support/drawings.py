@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pages without drawings, for tests of something else: each drawing takes a tenth of a second."""
+"""Pages without what takes long, for tests of something else: a drawing takes a tenth of a second."""
 
+from dlo_calibration.calibration import stages
 from dlo_calibration.report import drawing, landscape
 from dlo_calibration.report.figure import Panel
 
@@ -11,3 +12,8 @@ def leave_out_drawings(replace=setattr):
     """Let the page of a result have its words only; `replace` sets an attribute of a module."""
     for module in (drawing, landscape):
         replace(module, 'panel', lambda draw, words, legend=True: Panel('data:,', words))
+
+
+def leave_out_slices(replace=setattr):
+    """Let no slices be simulated, which takes the more time the more there is."""
+    replace(stages, 'simulate_slices', lambda *_, **__: None)

@@ -5,7 +5,7 @@
 
 from contextlib import contextmanager
 
-from drawings import leave_out_drawings
+from drawings import leave_out_drawings, leave_out_slices
 import pytest
 from toy_simulator import ToySimulator
 
@@ -23,6 +23,7 @@ def live_node(environment, folder, toy=None, **parameters):
 
     with robot_of(environment) as robot, pytest.MonkeyPatch.context() as patch:
         leave_out_drawings(patch.setattr)
+        leave_out_slices(patch.setattr)
         robot.calibrator = CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
                 Parameter(name, value=value)

@@ -20,11 +20,12 @@ def main():
     """Run it, as `dlo_calibration.ros.calibrator` runs the real one."""
     stop = StopFlag()
     stop.listen()
-    from drawings import leave_out_drawings
+    from drawings import leave_out_drawings, leave_out_slices
 
     from dlo_calibration.ros.calibrator_node import spin
 
     leave_out_drawings()
+    leave_out_slices()
     code = spin(sys.argv[2:], stop, functools.partial(make_toy, float(sys.argv[1])))
     stop.ignore()
     return code
