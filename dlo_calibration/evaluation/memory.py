@@ -34,6 +34,7 @@ class Memory:
                  on_failure: Callable[[str], None] = lambda _: None) -> None:
         self._log, self._engine, self._on_failure = log, engine, on_failure
         self._full = False
+        self._digests: dict[int, tuple[Trial, str]] = {}
 
     def of(self, evaluator: Evaluator, finer: bool = False) -> EvaluatorMemory:
         """
@@ -42,12 +43,20 @@ class Memory:
         :param finer: whether its simulator is the engine's refined one.
         """
         base = '' if self._log is None else digest(
-            self._engine, evaluator.simulator.name, finer, evaluator.trials, evaluator.space)
+            self._engine, evaluator.simulator.name, finer, [self.digest(trial) for trial in evaluator.trials],
+            evaluator.space)
         return EvaluatorMemory(self, base, evaluator)
 
     def simulator(self, simulator: Simulator) -> Simulator:
         """Return a simulator for this thread that remembers each rollout."""
         return simulator if self._log is None else _RememberingSimulator(self, self._engine, simulator)
+
+    def digest(self, trial: Trial) -> str:
+        """Return the digest of a trial, which is made once: a trial may have hundreds of goals."""
+        known = self._digests.get(id(trial))
+        if known is None:  # with the trial, so that no other one gets its id
+            known = self._digests[id(trial)] = trial, digest(trial)
+        return known[1]
 
     def find(self, key: str) -> Entry | None:
         """Return the entry with a key; None if there is none."""
@@ -122,7 +131,7 @@ class _RememberingSimulator:
         self._simulator.prepare()
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        key = f'{ROLLOUT}-{digest(self._engine, self.name, trial, physical)}'
+        key = f'{ROLLOUT}-{digest(self._engine, self.name, self._memory.digest(trial), physical)}'
         entry = self._memory.find(key)
         if entry is not None:
             if not len(entry.numbers):

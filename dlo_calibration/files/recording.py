@@ -187,7 +187,7 @@ class SessionWriter:
                 message_type, 'ros2msg', definition.encode())
         self._channels[topic, message_type] = self._writer.register_channel(
             topic, 'cdr', self._schemas[message_type],
-            {'offered_qos_profiles': _yaml([_qos(topic)]),
+            {'offered_qos_profiles': _qos_text(_is_latched(topic)),
              'topic_type_hash': typestore().hash_rihs01(message_type)})
         self._counts[topic, message_type] = 0
 
@@ -203,7 +203,7 @@ class SessionWriter:
             'topics_with_message_count': [
                 {'topic_metadata': {
                     'name': topic, 'type': message_type, 'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_qos(topic)],
+                    'offered_qos_profiles': [_qos(_is_latched(topic))],
                     'type_description_hash': typestore().hash_rihs01(message_type)},
                  'message_count': self._counts[topic, message_type]}
                 for topic, message_type in self._channels],
@@ -256,9 +256,17 @@ def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
     raise OSError(f'{path} and its numbered names all exist')
 
 
-def _qos(topic: str) -> dict[str, Any]:
+def _is_latched(topic: str) -> bool:
+    return topic.rsplit('/', 1)[-1] in LATCHED
+
+
+@lru_cache
+def _qos_text(latched: bool) -> str:
+    return _yaml([_qos(latched)])
+
+
+def _qos(latched: bool) -> dict[str, Any]:
     forever = {'sec': 9223372036, 'nsec': 854775807}  # rmw's infinite duration
-    latched = topic.rsplit('/', 1)[-1] in LATCHED
     return {'history': 'keep_last', 'depth': 1 if latched else 10, 'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',
             'deadline': forever, 'lifespan': forever, 'liveliness': 'automatic',

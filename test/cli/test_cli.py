@@ -49,8 +49,8 @@ TYPES = bag_types()
 
 @pytest.fixture
 def session(tmp_path):
-    """Give a session of two trials, recorded with options."""
-    return write_session(tmp_path / 'recorded', session_messages(TYPES, 2), {'evaluations': 20})
+    """Give a session of two trials in one file, recorded with options."""
+    return write_session(tmp_path / 'recorded.mcap', session_messages(TYPES, 2), {'evaluations': 20})
 
 
 @pytest.fixture
@@ -128,8 +128,9 @@ def test_fit_for_people_has_both_units_and_says_what_is_not_identifiable(run, se
     assert '\x1b' not in output  # no colours into a pipe
 
 
-def test_fit_writes_result_session_and_report_that_repeat_it(run, session, tmp_path, monkeypatch):
+def test_fit_writes_result_session_and_report_that_repeat_it(run, tmp_path, monkeypatch):
     monkeypatch.setattr(stages, 'simulate_slices', simulate_slices)  # the page has its slices here
+    session = write_session(tmp_path / 'recorded', session_messages(TYPES, 2), {'evaluations': 20})
     folder = tmp_path / 'new' / 'out'
     first = only_json(run('fit', session, '--json', '--output', folder, '--evaluations', 8)[1])
     assert {file.name for file in folder.iterdir()} == {
@@ -210,7 +211,7 @@ def test_validate_simulates_the_result_and_fits_nothing(run, session, tmp_path):
 
 def test_validate_on_another_session_uses_the_results_parameters(run, session, tmp_path):
     run('fit', session, '--output', tmp_path / 'out')
-    other = write_session(tmp_path / 'other', session_messages(TYPES, 1, first=4), {'seed': 5})
+    other = write_session(tmp_path / 'other.mcap', session_messages(TYPES, 1, first=4), {'seed': 5})
     found = only_json(run('validate', tmp_path / 'out' / 'result.xml', other, '--json')[1])
     assert found['trials'] == 1
     assert found['seed'] == 1
@@ -233,7 +234,7 @@ def test_info_tells_what_is_in_a_session(run, session):
 def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
     pairs = session_messages(TYPES, 2)
     pairs[5][1].header.frame_id = 'camera'
-    path = write_session(tmp_path / 'wrong', pairs)
+    path = write_session(tmp_path / 'wrong.mcap', pairs)
     code, output, _ = run('info', path, '--json')
     found = only_json(output)
     assert code == 0
@@ -243,7 +244,7 @@ def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
 
 
 def test_session_without_complete_trial_is_refused_by_fit_and_described_by_info(run, tmp_path):
-    path = write_session(tmp_path / 'half', session_messages(TYPES, 1)[:1])
+    path = write_session(tmp_path / 'half.mcap', session_messages(TYPES, 1)[:1])
     assert run('info', path)[0] == 0
     code, output, errors = run('fit', path, '--json')
     assert (code, output) == (2, '')

@@ -34,7 +34,7 @@ FILES = {'calibrations.jsonl', 'calibrations.csv', 'consistency.csv', 'validity.
 @pytest.fixture
 def session(tmp_path):
     """Give a session of three trials, whose recorded search an experiment does not take."""
-    return write_session(tmp_path / 'rope', session_messages(bag_types(), 3),
+    return write_session(tmp_path / 'rope.mcap', session_messages(bag_types(), 3),
                          {'evaluations': 3, 'seed': 9, 'mass': 0.1})
 
 
@@ -125,7 +125,7 @@ def test_what_is_done_is_not_done_again_and_more_runs_come_on_top(run, session, 
 
 
 def test_another_session_or_option_in_the_same_folder_is_not_mixed_up(run, session, tmp_path, undrawn):
-    other = write_session(tmp_path / 'other' / 'rope', session_messages(bag_types(), 3, first=2),
+    other = write_session(tmp_path / 'other' / 'rope.mcap', session_messages(bag_types(), 3, first=2),
                           {'mass': 0.1})
     out, fresh = tmp_path / 'out', tmp_path / 'fresh'
     once = ('--runs', 1, *SMALL[2:])
@@ -144,7 +144,7 @@ def test_chosen_trials_are_held_back(run, session, tmp_path, undrawn):
 
 
 def test_another_session_may_judge(run, session, tmp_path, undrawn):
-    other = write_session(tmp_path / 'other', session_messages(bag_types(), 2, first=3), {'seed': 3})
+    other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 2, first=3), {'seed': 3})
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--validate-on', other, '--json',
                           '--output', tmp_path / 'out')
     one, = json.loads(output)['findings']
@@ -155,7 +155,7 @@ def test_another_session_may_judge(run, session, tmp_path, undrawn):
 
 
 def test_sessions_of_one_name_stay_apart(run, session, tmp_path, undrawn):
-    other = write_session(tmp_path / 'other' / 'rope', session_messages(bag_types(), 3, first=2))
+    other = write_session(tmp_path / 'other' / 'rope.mcap', session_messages(bag_types(), 3, first=2))
     found = json.loads(run(session, other, '--runs', 1, '--search', 'random', '--evaluations', 4, '--json',
                            '--output', tmp_path / 'out')[1])
     assert [one['subject'] for one in found['findings']] == ['rope', 'rope_2']
@@ -288,11 +288,11 @@ def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
 
 
 def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path, undrawn):
-    short = write_session(tmp_path / 'short', session_messages(bag_types(), 1))
+    short = write_session(tmp_path / 'short.mcap', session_messages(bag_types(), 1))
     code, _, errors = run(short, '--output', tmp_path / 'out')
     assert code == 2
     assert '--validate-on' in errors
-    other = write_session(tmp_path / 'other', session_messages(bag_types(), 1, first=1))
+    other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 1, first=1))
     assert run(short, '--validate-on', other, '--runs', 1, '--evaluations', 3, '--search', 'random',
                '--output', tmp_path / 'out')[0] == 0
 

@@ -94,7 +94,7 @@ def test_options_of_the_machine_never_come_from_a_file(write, tmp_path, as_an_at
     """All at once: the test above makes sure that these are all."""
     evil = write(tmp_path, OF_THE_MACHINE)
     if write is result_file:
-        session = write_session(tmp_path / 'of_mine', session_messages(TYPES, 1))
+        session = write_session(tmp_path / 'of_mine.mcap', session_messages(TYPES, 1))
         lines = [['validate', evil, session], ['plot', session, evil, '--output', tmp_path]]
     else:
         lines = [['fit', evil], ['info', evil], ['info', evil, '--json']]
@@ -198,7 +198,7 @@ def test_a_foreign_scene_is_refused_until_it_is_given(write, tmp_path, reached, 
     file = write(tmp_path / 'given', {'scene': str(secret)})
     line = ['fit', str(file)]
     if write is result_file:
-        line = ['validate', str(file), str(write_session(tmp_path / 'mine', session_messages(TYPES, 1)))]
+        line = ['validate', str(file), str(write_session(tmp_path / 'mine.mcap', session_messages(TYPES, 1)))]
     assert cli.main(line, reached.make) == 2
     errors = capsys.readouterr().err.splitlines()
     assert reached == [] and [text for text in errors if 'scene' in text] == errors[-1:]

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures('without_drawings')  # of the page; the pic
 
 @pytest.fixture
 def session(tmp_path):
-    return write_session(tmp_path / 'recorded', session_messages(bag_types(), 2),
+    return write_session(tmp_path / 'recorded.mcap', session_messages(bag_types(), 2),
                          {'evaluations': 3})
 
 

@@ -29,7 +29,8 @@ FINISHED = {fit.RESULT, fit.SESSION, fit.REPORT, fit.EVALUATIONS}
 @pytest.fixture
 def session(tmp_path):
     """Give a session of two trials, recorded with options."""
-    return write_session(tmp_path / 'recorded', session_messages(bag_types(), 2), {'workers': 1, 'nodes': 31})
+    return write_session(tmp_path / 'recorded.mcap', session_messages(bag_types(), 2),
+                         {'workers': 1, 'nodes': 31})
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_other_options_are_refused_and_those_of_the_machine_are_not(words, part,
 def test_a_session_that_is_named_again_must_have_the_same_trials(session, tmp_path, act, abandon):
     out = tmp_path / 'out'
     abandon(10, 'fit', session, '--output', out, *FLAGS)
-    other = write_session(tmp_path / 'other', session_messages(bag_types(), 1), {'workers': 1})
+    other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 1), {'workers': 1})
     code, _, errors, _ = act('fit', other, '--resume', out)
     assert code == 2
     assert 'of another calibration' in errors

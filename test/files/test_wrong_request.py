@@ -62,7 +62,7 @@ def test_goals_without_initial_chain_wait_visibly_and_are_refused_once_when_one_
 
 def test_goals_without_initial_chain_in_a_file(tmp_path, command):
     orphans = goals_without_initial_chain(FILES)
-    path = write_session(tmp_path / 'alone', orphans)
+    path = write_session(tmp_path / 'alone.mcap', orphans)
     code, about, errors = command('info', path, '--json')
     refusal, = about['refusals']
     assert (code, errors) == (0, [])
@@ -72,7 +72,7 @@ def test_goals_without_initial_chain_in_a_file(tmp_path, command):
     assert (code, result, errors[0]) == (2, None, refusal)
     assert 'got no complete trial, expected an initial_chain, an action and a goal_chain' in errors[1]
     assert len(errors) == 2
-    path = write_session(tmp_path / 'followed', [*orphans, *session_messages(FILES, 1, first=1)], QUICK)
+    path = write_session(tmp_path / 'followed.mcap', [*orphans, *session_messages(FILES, 1, first=1)], QUICK)
     code, result, errors = command('fit', path, '--json')
     refusal, = errors
     assert (code, result['trials']) == (0, 1)
@@ -93,7 +93,7 @@ def test_start_without_trials_is_refused_at_both_doors(ros_environment, tmp_path
         robot.until_status(trials='2')
         assert robot.call('start').success
         robot.until_result()
-    path = write_session(tmp_path / 'session', GOOD[:1])
+    path = write_session(tmp_path / 'session.mcap', GOOD[:1])
     code, output, errors = command('fit', path, '--json')
     assert (code, output, len(errors)) == (2, None, 1)
     for word in (str(path), 'no complete trial', 'an initial_chain, an action and a goal_chain', 'info'):
@@ -240,7 +240,7 @@ def test_folder_that_goes_away_is_told_and_the_calibration_goes_on(ros_environme
 
 @pytest.mark.parametrize('name', ['result.xml', 'session.mcap', 'report.html', 'evaluations.csv'])
 def test_fit_on_a_disk_that_fills_up_prints_the_result_and_one_line(tmp_path, command, monkeypatch, name):
-    path = write_session(tmp_path / 'session', GOOD, QUICK)
+    path = write_session(tmp_path / 'session.mcap', GOOD, QUICK)
     done, replace = [], os.replace
 
     def refuse(new, where):

@@ -91,7 +91,7 @@ def test_session_with_thousands_of_bad_messages_is_told_in_one_line_for_each_rea
     bad = [(GOAL, with_point(4, float('nan'))(TYPES)) for _ in range(300)]
     for k, (_, message) in enumerate(bad):
         message.header.stamp.sec = 200 + k
-    path = write_session(tmp_path / 'session', [*session_messages(TYPES, 1), *bad])
+    path = write_session(tmp_path / 'session.mcap', [*session_messages(TYPES, 1), *bad])
     refusal, = session_trials(read_session(path), Options())[1]
     assert refusal.startswith('goal_chain stamped 200 s: ') and refusal.endswith(' (and 299 more like it)')
     assert main(['info', str(path)], new_toy) == 0

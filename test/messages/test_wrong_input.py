@@ -120,7 +120,7 @@ def test_wrong_message_on_a_topic_is_refused_once_and_the_trials_stay(topics, ca
 
 @pytest.mark.parametrize('case', WRONG, ids=lambda case: case.name)
 def test_wrong_message_in_a_file_is_refused_once_and_the_trials_calibrate(tmp_path, command, case):
-    path = write_session(tmp_path / 'session', [*GOOD, (case.kind, made(case, FILES))], QUICK)
+    path = write_session(tmp_path / 'session.mcap', [*GOOD, (case.kind, made(case, FILES))], QUICK)
     session = read_session(path)
     trials, (refusal,) = session_trials(session, Options())
     assert (len(trials), session.problems) == (2, ())
@@ -136,7 +136,7 @@ def test_live_and_replayed_refusals_are_the_same(topics, tmp_path):
     case = next(case for case in WRONG if case.name == 'fewer points')
     with topics.refusing() as live:
         topics.robot.send([(case.kind, made(case, topics.types))])
-    path = write_session(tmp_path / 'session', [*GOOD, (case.kind, made(case, FILES))])
+    path = write_session(tmp_path / 'session.mcap', [*GOOD, (case.kind, made(case, FILES))])
     refusal, = session_trials(read_session(path), Options())[1]
     assert live.text in (refusal, f'{refusal} (2 times)')  # where another test had it refused before
 
@@ -175,7 +175,7 @@ def test_wrong_parameter_is_refused_once_by_the_live_node(topics, name, value, t
 
 @pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
 def test_wrong_parameter_is_refused_once_by_the_command_line(tmp_path, command, name, value, text):
-    path = write_session(tmp_path / 'session', GOOD, QUICK)
+    path = write_session(tmp_path / 'session.mcap', GOOD, QUICK)
     words = value if isinstance(value, list) else [value]
     code, output, (error,) = command('fit', path, '--json', f'--{name}', *words)
     assert (code, output) == (2, None)
@@ -188,7 +188,7 @@ def test_wrong_parameter_is_refused_once_by_the_command_line(tmp_path, command, 
 
 @pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
 def test_wrong_parameter_recorded_in_a_file_is_left_out_and_told_once(tmp_path, command, name, value, text):
-    path = write_session(tmp_path / 'session', GOOD, {**QUICK, name: value})
+    path = write_session(tmp_path / 'session.mcap', GOOD, {**QUICK, name: value})
     flags = (word for one in QUICK for word in (f'--{one}', *np.atleast_1d(QUICK[one])))
     code, result, errors = command('fit', path, '--json', *flags)
     problem, = errors
@@ -216,7 +216,7 @@ def collected(messages):
     return collector
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
 def test_mutated_bytes_are_collected_or_refused(messages):
     collector = collected([
@@ -226,7 +226,7 @@ def test_mutated_bytes_are_collected_or_refused(messages):
         score_of(collector.trials)
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_mutated_fields_are_collected_or_refused(data):
     originals = fuzzed_pairs(FILES, 'world')

@@ -184,7 +184,7 @@ def test_best_effort_publishers_are_heard(start_node, ros_environment):
 
 
 def test_burst_of_goal_chains_arrives_whole(start_node, tmp_path):
-    robot = start_node()
+    robot = start_node(evaluations=3)
     initial, action, (_, goal) = session_messages(TYPES, 1)
     robot.send([initial, action])
     robot.until(lambda: robot.status['incomplete'].startswith('a goal_chain'))
