@@ -277,7 +277,7 @@ def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
     (('{session}', '--held-back', '1', '--validate-on', '{session}'), 'not allowed with'),
     (('{session}', '--validate-on', '{session}', '{session}'), '--validate-on: got 2 session(s)'),
     (('{session}', '--mass', '-1'), 'parameter mass'),
-    (('{session}', '--output', '{session}/metadata.yaml'), '--output'),
+    (('{session}', '--output', '{session}'), '--output'),
     (('{session}', '--record'), '--record'),
 ], ids=lambda one: one if isinstance(one, str) else None)
 def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):

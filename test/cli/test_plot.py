@@ -15,7 +15,7 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.report.figure import SIMULATED
 
-pytestmark = pytest.mark.usefixtures('without_drawings')  # of the page; the pictures are drawn
+pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')  # of the page
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def run(capsys):
 
 @pytest.fixture
 def result(run, session, tmp_path):
-    assert run('fit', session, '--output', tmp_path / 'fitted')[0] == 0
+    assert run('fit', session, '--workers', 1, '--output', tmp_path / 'fitted')[0] == 0
     return tmp_path / 'fitted' / 'result.xml'
 
 
@@ -92,6 +92,8 @@ def test_a_picture_that_cannot_be_written_prevents_no_other(run, session, tmp_pa
 
 
 def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
+    monkeypatch.setattr('dlo_calibration.report.drawing.session_picture',
+                        lambda trials, chains, path: path.touch())
     (tmp_path / 'here').mkdir()
     monkeypatch.chdir(tmp_path / 'here')
     assert run('plot', session)[0] == 0
@@ -100,8 +102,8 @@ def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(('words', 'said'), [
     (['--animation'], 'RESULT.xml'),
-    (['--output', '{session}/metadata.yaml'], '--output'),
-    (['{session}/metadata.yaml'], 'metadata.yaml'),
+    (['--output', '{session}'], '--output'),
+    (['{session}'], 'recorded.mcap'),
 ], ids=['animation of nothing', 'folder that is a file', 'result that is none'])
 def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
     code, output, errors = run('plot', session, *(word.format(session=session) for word in words))
@@ -111,6 +113,6 @@ def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
 
 def test_session_without_trials_is_refused(run, tmp_path):
     initial, *_ = session_messages(bag_types(), 1)
-    code, _, errors = run('plot', write_session(tmp_path / 'short', [initial]))
+    code, _, errors = run('plot', write_session(tmp_path / 'short.mcap', [initial]))
     assert code == 2
     assert 'no complete trial' in errors
