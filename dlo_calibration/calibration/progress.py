@@ -20,11 +20,14 @@ class Progress:
 
     :param evaluations: largest number of evaluations.
     :param trials: number of trials that each evaluation simulates.
+    :param known: number of evaluations that a log answers: they tell nothing about the speed.
     :param clock: the time [s].
     """
 
-    def __init__(self, evaluations: int, trials: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, evaluations: int, trials: int, known: int = 0,
+                 clock: Callable[[], float] = time.monotonic) -> None:
         self.evaluations = evaluations
+        self._known = known
         self.count = 0
         self.newest: Evaluation | None = None
         self.best: Evaluation | None = None
@@ -36,7 +39,10 @@ class Progress:
     def take(self, evaluation: Evaluation) -> None:
         """Count the next evaluation."""
         self.count += 1
-        self._simulations += self._trials - evaluation.skipped
+        if self.count > self._known:
+            self._simulations += self._trials - evaluation.skipped
+        else:
+            self._begun = self._clock()
         self.newest = evaluation
         if self.best is None or evaluation.score < self.best.score:
             self.best = evaluation
@@ -59,14 +65,14 @@ class Progress:
 
     @property
     def simulations_per_second(self) -> float:
-        """Rollouts per second so far."""
+        """Rollouts per second, of those that were made."""
         return self._simulations / self._elapsed
 
     @property
     def seconds_left(self) -> float:
-        """Time until the last evaluation [s], at the speed so far; infinite before the first."""
-        left = self.evaluations - self.count
-        return self._elapsed / self.count * left if self.count else float('inf')
+        """Time until the last evaluation [s], at the speed so far; infinite before one was made."""
+        left, made = self.evaluations - self.count, self.count - self._known
+        return self._elapsed / made * left if made > 0 else float('inf')
 
     @property
     def _elapsed(self) -> float:

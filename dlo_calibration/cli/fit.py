@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 import shutil
 import sys
@@ -14,17 +15,19 @@ from typing import Callable
 
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.cli.options import given_options
-from dlo_calibration.cli.output import print_result, tell
+from dlo_calibration.cli.output import print_json, print_result, tell
 from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.cli.unfinished import Unfinished
+from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import SessionWriter
-from dlo_calibration.files.result import write_result
+from dlo_calibration.files.result import HOW, read_result, write_result
 from dlo_calibration.files.session import trial_records
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import Attempts, make_folder, whole
@@ -54,7 +57,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         unfinished, log = None, None
         if chosen.resume is not None:
             if not Unfinished.is_in(chosen.resume):
-                return _say_finished(chosen.resume)
+                return _finished(chosen, make_simulator)
             unfinished = stack.enter_context(Unfinished(chosen.resume, INPUTS))
             unfinished.complete(chosen)
         elif chosen.session is None:
@@ -88,7 +91,8 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
             told.append(text)
 
     with StopFlag() as stop:
-        with SearchBar(source.options.evaluations, sys.stderr, shown=not chosen.json) as bar:
+        with SearchBar(source.options.evaluations, sys.stderr, shown=not chosen.json,
+                       known=log.evaluations if log else 0) as bar:
             try:
                 result = calibrate(
                     source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
@@ -114,12 +118,25 @@ def _files(source: Source) -> list[str]:
     return [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
 
 
-def _say_finished(folder: Path) -> int:
-    """Say that there is nothing to resume in a folder."""
+def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """
+    Say that there is nothing to resume in a folder, and print its result, if JSON is wanted.
+
+    Its trials are simulated once more, as the file does not hold all that the document tells.
+    """
+    folder: Path = chosen.resume
     if not (folder / RESULT).is_file():
         raise InputError(f'folder {folder}', 'no interrupted calibration', 'one that fit --output began',
                          'check the folder, or begin with fit SESSION --output')
     tell(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
+    if chosen.json:
+        file = read_result(folder / RESULT)
+        if chosen.session is None:
+            chosen.session = folder / (REQUEST if (folder / REQUEST).is_file() else SESSION)
+        source = read_source(chosen, tell, file.file_options).require_trials()
+        result = replace(validated(file, source.trials, source.options, make_simulator),
+                         warnings=file.warnings, confirmation=file.confirmation)
+        print_json({**plain(result), **{name: getattr(file, name) for name in HOW}})
     return 0
 
 

@@ -40,15 +40,17 @@ class SearchBar:
 
     :param total: largest number of evaluations.
     :param shown: False: nothing is shown on a terminal, either.
+    :param known: number of evaluations that a log answers: they tell nothing about the time left.
     """
 
-    def __init__(self, total: int, stream: TextIO, shown: bool = True) -> None:
+    def __init__(self, total: int, stream: TextIO, shown: bool = True, known: int = 0) -> None:
         self._progress = Progress(
             TextColumn('calibrating'), BarColumn(), MofNCompleteColumn(),
             TextColumn('best score {task.fields[best]}'), TimeRemainingColumn(),
             console=console(stream), disable=not (shown and stream.isatty()))
         self._task = self._progress.add_task('', total=total, best='-')
         self._best = float('inf')
+        self._known = known
 
     def __enter__(self) -> SearchBar:
         """Show it."""
@@ -66,7 +68,10 @@ class SearchBar:
     def move(self, count: int, best: float) -> None:
         """Show that `count` evaluations were made, and their best score."""
         self._best = best
-        self._progress.update(self._task, completed=count, best=number(best))
+        if count <= self._known:  # the speed is that of what comes after
+            self._progress.reset(self._task, completed=count, best=number(best))
+        else:
+            self._progress.update(self._task, completed=count, best=number(best))
 
 
 class TaskBar:

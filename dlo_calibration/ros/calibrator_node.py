@@ -35,9 +35,9 @@ from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 from dlo_calibration.messages.stamp_order import MARGIN
 from dlo_calibration.ros.inbox import Inbox
-from dlo_calibration.ros.memory import Pace
 from dlo_calibration.ros.parameters import OptionsNode
 from dlo_calibration.ros.session import CalibrationSession
+from dlo_calibration.ros.situation import Pace
 
 LOG = logging.getLogger('dlo_calibration')  # where the rest of the package logs its notices
 ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole

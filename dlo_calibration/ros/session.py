@@ -31,8 +31,8 @@ from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.graph import Graph
 from dlo_calibration.ros.markers import markers
-from dlo_calibration.ros.memory import Calibration, Memory, Pace
 from dlo_calibration.ros.recorder import Recorder
+from dlo_calibration.ros.situation import Calibration, Pace, Situation
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
@@ -60,7 +60,7 @@ class CalibrationSession:
         self._worker = Worker(make_simulator)
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
-        self._memory = Memory()
+        self._situation = Situation()
         self._calibration: Calibration | None = None
         self._order = StampOrder()
         self._began = self._clock()
@@ -88,17 +88,17 @@ class CalibrationSession:
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
         if kind != INITIAL:
-            self._memory.heard = self._clock()
-            self._memory.markers.wanted = self._memory.appraisal.wanted = True
+            self._situation.heard = self._clock()
+            self._situation.markers.wanted = self._situation.appraisal.wanted = True
         problem = problem if message is None else self._collect(message)
         if problem:
             self.refuse(problem)
         elif not self.calibrating:
-            self._memory.state, self._memory.detail = 'collecting', ''
+            self._situation.state, self._situation.detail = 'collecting', ''
 
     def drop(self, counts: Mapping[str, int]) -> None:
         """Take note of messages of some kinds that came, and were dropped."""
-        self._memory.dropped.update(counts)
+        self._situation.dropped.update(counts)
 
     def keep(self, kind: str, octets: bytes) -> None:
         """Record a message, as no time is left to collect it."""
@@ -110,10 +110,10 @@ class CalibrationSession:
 
     def refuse(self, text: str) -> None:
         """Tell why something was refused, in the log and in ``~/status``; a repeated reason not each time."""
-        text, memory = told(text), self._memory
-        memory.refusals.append(text)
-        memory.last_refusal = memory.counted.add(text)
-        self._tell_refusals(memory.counted.due(self._clock()))
+        text, situation = told(text), self._situation
+        situation.refusals.append(text)
+        situation.last_refusal = situation.counted.add(text)
+        self._tell_refusals(situation.counted.due(self._clock()))
 
     def request(self, name: str) -> tuple[bool, str]:
         """Serve a request `start`, `stop` or `reset`; return whether that succeeded, and the answer."""
@@ -130,20 +130,20 @@ class CalibrationSession:
         """Do what is due now; the node calls this many times a second."""
         self._take_events()
         self._recorder.tell()
-        self._tell_refusals(self._memory.counted.due(self._clock()))
+        self._tell_refusals(self._situation.counted.due(self._clock()))
         self._tell_dropped()
         self._start_by_itself()
         self._appraise()
         # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
         period = 1.0 + 0.1 * self._collector.count
-        if self._memory.markers.wanted and not self.behind and self._collector.count \
-                and self._clock() - self._memory.markers.last >= period:
+        if self._situation.markers.wanted and not self.behind and self._collector.count \
+                and self._clock() - self._situation.markers.last >= period:
             self._show()
         self._report()
 
     def fail(self, text: str, *log: str) -> None:
         """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
-        self._memory.state, self._memory.detail = 'failed', told(text)
+        self._situation.state, self._situation.detail = 'failed', told(text)
         for line in log or (text,):
             self._graph.error(line)
         self._report()
@@ -157,7 +157,7 @@ class CalibrationSession:
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
                 self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
-            self._tell_refusals(self._memory.counted.rest())
+            self._tell_refusals(self._situation.counted.rest())
         finally:
             self._recorder.close()
 
@@ -196,7 +196,7 @@ class CalibrationSession:
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
         self._order, self._began = self._order.after_jump(), self._clock()
-        if self._memory.heard == float('-inf'):  # only initial chains came: there is no session to keep
+        if self._situation.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self._collector.clear()
             self._graph.warn(why)
             return
@@ -217,7 +217,7 @@ class CalibrationSession:
         options = self._graph.options()
         if options != self._collected_with:
             self._collector, self._collected_with = self._collector.with_options(options), options
-        known = set(self._memory.refusals)
+        known = set(self._situation.refusals)
         for problem in self._collector.problems:
             if str(problem) not in known:
                 self.refuse(str(problem))
@@ -227,25 +227,26 @@ class CalibrationSession:
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
         self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         log = self._recorder.start(trials, options)
-        self._calibration = Calibration(options, Progress(options.evaluations, len(trials)), self._memory)
-        memory = self._memory
-        memory.started, memory.state, memory.detail = True, 'calibrating', log.resumed if log else ''
+        situation = self._situation
+        progress = Progress(options.evaluations, len(trials), log.evaluations if log else 0)
+        self._calibration = Calibration(options, progress, situation)
+        situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
-        memory.appraisal.wanted = True  # again after the calibration, as this one was stopped
+        situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
         self._worker.start(trials, options, log)
         return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
 
     def _start_by_itself(self) -> None:
-        memory, wanted = self._memory, self._graph.options().start_after_trials
-        if self.calibrating or memory.started or not 0 < wanted <= self._collector.count:
+        situation, wanted = self._situation, self._graph.options().start_after_trials
+        if self.calibrating or situation.started or not 0 < wanted <= self._collector.count:
             return
         # A trial may have many goal chains: it is complete when the next trial begins, or no message follows.
-        if self._collector.count > wanted or self._clock() - memory.heard > QUIET:
-            memory.started = True
+        if self._collector.count > wanted or self._clock() - situation.heard > QUIET:
+            situation.started = True
             try:
                 self._graph.info(self._start())
             except InputError as error:
-                memory.state, memory.detail = 'failed', str(error)
+                situation.state, situation.detail = 'failed', str(error)
                 self.refuse(str(error))
 
     def _stop(self) -> str:
@@ -267,8 +268,8 @@ class CalibrationSession:
         self._appraiser.stop()
         self._collected_with = self._graph.options()
         self._collector = TrialCollector(self._collected_with)
-        self._tell_refusals(self._memory.counted.rest())
-        self._memory = Memory(state='calibrating' if self.calibrating else 'collecting')
+        self._tell_refusals(self._situation.counted.rest())
+        self._situation = Situation(state='calibrating' if self.calibrating else 'collecting')
         self._began = self._clock()
         self._begin_recording()
         self._show()
@@ -278,7 +279,7 @@ class CalibrationSession:
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():
             if isinstance(event, Notice):
-                self._memory.detail = told(event.text)
+                self._situation.detail = told(event.text)
                 self._graph.warn(event.text)
             elif not isinstance(event, Evaluation):
                 self._finish(event)
@@ -297,11 +298,11 @@ class CalibrationSession:
             self._recorder.finish(interrupted=True)
             self.fail(event.text, f'calibration failed: {event.text}', *filter(None, [event.details]))
             return
-        memory, options = self._memory, calibration.options
-        memory.state, memory.detail = 'done', event.stop_reason
-        calibration.memory.result = event
-        if memory is not calibration.memory:
-            memory.detail += '; this is the result of the session before the clock went back'
+        situation, options = self._situation, calibration.options
+        situation.state, situation.detail = 'done', event.stop_reason
+        calibration.situation.result = event
+        if situation is not calibration.situation:
+            situation.detail += '; this is the result of the session before the clock went back'
         found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
                           f'{measured(one.physical_value, one.physical_unit)}'
                           for name, one in event.parameters.items())
@@ -319,28 +320,28 @@ class CalibrationSession:
 
     def _appraise(self) -> None:
         """Take finished appraisals; start one if trials changed and no calibration is under way."""
-        memory, now = self._memory, self._clock()
+        situation, now = self._situation, self._clock()
         for information in self._appraiser.waiting_information():
-            memory.information = information
-        quiet = now - memory.heard > QUIET
+            situation.information = information
+        quiet = now - situation.heard > QUIET
         # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
-        if memory.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
-                and not self._appraiser.alive and (quiet or now - memory.appraisal.last > 2.0):
-            memory.appraisal = Pace(wanted=not quiet, last=now)
-            self._appraiser.start(self._collector.trials, self._graph.options(), memory.result, whole=quiet)
+        if situation.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
+                and not self._appraiser.alive and (quiet or now - situation.appraisal.last > 2.0):
+            situation.appraisal = Pace(wanted=not quiet, last=now)
+            self._appraiser.start(self._collector.trials, self._graph.options(), situation.result, quiet)
 
     # Messages of the node
 
     def _tell_dropped(self, at_once: bool = False) -> None:
         """Tell how many messages were dropped, if that number has changed, at most once a second."""
-        memory, now = self._memory, self._clock()
-        if memory.dropped != memory.told_dropped and (at_once or now - memory.telling.last > 1.0):
-            memory.telling.last = now
-            for kind, count in (memory.dropped - memory.told_dropped).items():
+        situation, now = self._situation, self._clock()
+        if situation.dropped != situation.told_dropped and (at_once or now - situation.telling.last > 1.0):
+            situation.telling.last = now
+            for kind, count in (situation.dropped - situation.told_dropped).items():
                 self._graph.warn(f'{kind}: {count} message(s) were dropped, as they came faster than they '
                                  'can be read; publish fewer a second')
-            memory.told_dropped = Counter(memory.dropped)
-            self._recorder.dropped(memory.dropped)
+            situation.told_dropped = Counter(situation.dropped)
+            self._recorder.dropped(situation.dropped)
 
     def _send_progress(self, calibration: Calibration) -> None:
         """Send the newest evaluation, unless it has been sent."""
@@ -355,20 +356,20 @@ class CalibrationSession:
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        memory = self._memory
+        situation = self._situation
         content: dict[str, Any] = {
-            'state': memory.state, 'trials': self._collector.count, 'last_refusal': memory.last_refusal,
-            'incomplete': self._collector.incomplete, 'detail': memory.detail,
-            'information': memory.information, 'dropped': memory.told_dropped.total()}
-        if content != memory.status:
-            memory.status = content
+            'state': situation.state, 'trials': self._collector.count, 'last_refusal': situation.last_refusal,
+            'incomplete': self._collector.incomplete, 'detail': situation.detail,
+            'information': situation.information, 'dropped': situation.told_dropped.total()}
+        if content != situation.status:
+            situation.status = content
             self._send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))
 
     def _show(self) -> None:
         """Send the markers of all trials."""
-        self._memory.markers = Pace(last=self._clock())
+        self._situation.markers = Pace(last=self._clock())
         self._send('markers', markers(self._types, self._collector.trials, stamp=self._graph.stamp(),
-                                      frame_id=self._collector.frame_id, result=self._memory.result))
+                                      frame_id=self._collector.frame_id, result=self._situation.result))
 
     def _send(self, name: str, message: Any) -> None:
         octets = self._graph.encode(name, message)
@@ -389,7 +390,7 @@ class CalibrationSession:
             self._report()
 
     def _fail_to_record(self, text: str) -> None:
-        self._memory.last_refusal = text
+        self._situation.last_refusal = text
         self._graph.error(text)
         self._report()
 

@@ -280,6 +280,17 @@ def test_progress_tells_speed_and_time_left():
     assert progress.seconds_left == 3.0
 
 
+def test_what_a_log_answers_does_not_make_progress_look_fast():
+    now = [100.0]
+    progress = Progress(10, 3, known=2, clock=lambda: now[0])
+    one = Evaluation(0, np.zeros(1), {}, (1.0,))
+    for seconds, speed, left in ((0.0, 0.0, float('inf')), (0.1, 0.0, float('inf')), (3.0, 1.0, 21.0),
+                                 (3.0, 1.0, 18.0)):
+        now[0] += seconds
+        progress.take(one)
+        assert (progress.simulations_per_second, progress.seconds_left) == (speed, left)
+
+
 def test_progress_tells_how_far_good_evaluations_lie_apart():
     """The best 5 % count, 8 at least, by their root mean square distance from the best; failures never do."""
     def tried(index, value, scores, **rest):

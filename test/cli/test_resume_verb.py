@@ -3,6 +3,7 @@
 
 """`fit --resume`: what a killed `fit --output` leaves, and how it goes on."""
 
+import json
 import os
 from pathlib import Path
 import signal
@@ -97,7 +98,14 @@ def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
     assert names(out) == FINISHED
     code, output, errors, toy = act('fit', '--resume', out)
     assert (code, output, toy.count) == (0, '', 0)
-    assert errors == f'nothing to resume: the calibration is finished, and its result is {out / fit.RESULT}\n'
+    said = f'nothing to resume: the calibration is finished, and its result is {out / fit.RESULT}\n'
+    assert errors == said
+    code, output, errors, toy = act('fit', '--resume', out, '--json')
+    assert (code, errors, toy.count) == (0, said, 2)  # the trials once, and no search
+    found, file = json.loads(output), read_result(out / fit.RESULT)
+    assert {name: one['value'] for name, one in found['parameters'].items()} == file.values
+    assert (found['score'], found['evaluations'], found['seconds']) == (file.score, 25, file.seconds)
+    assert (found['stop_reason'], found['warnings']) == (file.stop_reason, list(file.warnings))
 
 
 def test_the_same_command_goes_on_and_another_calibration_is_not_lost(session, tmp_path, act, abandon):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Memory: what a session of the node remembers."""
+"""Situation: what the node knows of its session, besides the messages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Pace:
 
 
 @dataclass
-class Memory:
+class Situation:
     """
     What a reset forgets, besides the trials.
 
@@ -68,11 +68,11 @@ class Calibration:
     """
     A calibration under way.
 
-    :param memory: of the session in which it started, which may have ended since.
+    :param situation: of the session in which it started, which may have ended since.
     :param sent: time of its last progress message [s].
     """
 
     options: Options
     progress: Progress
-    memory: Memory
+    situation: Situation
     sent: float = float('-inf')

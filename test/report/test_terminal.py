@@ -1,0 +1,30 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The progress bar tells a time left only from what was simulated now."""
+
+import io
+
+from dlo_calibration.report.terminal import SearchBar
+
+
+class Terminal(io.StringIO):
+    """Text that is shown on a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def last_line(known):
+    """Return what is left of a bar after eight of ten evaluations."""
+    stream = Terminal()
+    with SearchBar(10, stream, known=known) as bar:
+        for count in range(1, 9):
+            bar.move(count, 5.0)
+    return next(line for line in reversed(stream.getvalue().splitlines()) if '8/10' in line)
+
+
+def test_what_a_log_answers_tells_no_time_left(monkeypatch):
+    monkeypatch.setenv('TERM', 'xterm')
+    assert '-:--:--' not in last_line(0)
+    assert '-:--:--' in last_line(8)
