@@ -8,14 +8,14 @@ import json
 import numpy as np
 from PIL import Image, ImageColor
 import pytest
-from toy_messages import session_messages, write_session
-from toy_simulator import ToySimulator
+from toy_messages import session_messages, toy_trials, write_session
+from toy_simulator import new_toy, ToySimulator
 
+from dlo_calibration import calibrate, Options
 from dlo_calibration.cli import main as cli
+from dlo_calibration.files.result import write_result
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.report.figure import SIMULATED
-
-pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')  # of the page
 
 
 @pytest.fixture
@@ -38,9 +38,11 @@ def run(capsys):
 
 
 @pytest.fixture
-def result(run, session, tmp_path):
-    assert run('fit', session, '--workers', 1, '--output', tmp_path / 'fitted')[0] == 0
-    return tmp_path / 'fitted' / 'result.xml'
+def result(tmp_path):
+    options = Options.of({'evaluations': 3, 'workers': 1})
+    write_result(tmp_path / 'result.xml', calibrate(toy_trials(2), options, make_simulator=new_toy),
+                 options.flat())
+    return tmp_path / 'result.xml'
 
 
 def written(folder):

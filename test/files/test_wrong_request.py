@@ -340,7 +340,7 @@ def recorded_octets(tmp_path_factory):
     return file.read_bytes()
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.floats(0, 1), octets=st.binary(max_size=9))
 def test_cut_or_damaged_file_ends_in_a_result_or_one_line(
         recorded_octets, tmp_path_factory, command, place, octets):

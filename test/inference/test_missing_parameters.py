@@ -22,7 +22,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 def found(trials, space=EVEN):
     simulator = CompiledSimulator(table=False, nodes=21)
-    result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=80)
+    result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=40)
     return with_missing_parameters(Setting(result.trials, Options(), simulator), result)
 
 
@@ -61,6 +61,6 @@ def test_nothing_is_named_that_would_not_help():
 def test_a_stop_leaves_the_result_as_it_is():
     trials = observed(ParameterSpace((*EVEN.free, 'length_scale')), {**TRUTH, 'length_scale': 40.0})
     simulator = CompiledSimulator(table=False, nodes=21)
-    result = fitted(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=80)
+    result = fitted(trials, EVEN, simulator, LeastSquares(EVEN.dimension, 1), budget=12)
     setting = Setting(result.trials, Options(), simulator, should_stop=lambda: True)
     assert with_missing_parameters(setting, result) is result

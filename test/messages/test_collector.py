@@ -522,7 +522,7 @@ def feed(messages, options):
     return collector
 
 
-@settings(max_examples=500)
+@settings(max_examples=250)
 @given(session=sessions())
 def test_any_order_of_arrival_gives_the_same_trials(session):
     ordered, arrived, options = session

@@ -137,14 +137,14 @@ def test_friction_is_that_of_the_scene(scene):
 
 def test_a_repeat_in_a_scene_is_bit_exact_whatever_was_simulated_between(scene):
     path = scene(BOX.format(friction=0.7))
-    simulator = BulletSimulator(scene=path, settle_limit=2.0)
+    simulator = BulletSimulator(scene=path, settle_limit=0.5)
     sideways = dropped(0.22, push=(0.02, 0.15, 0.05))
     first = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.simulate(dropped(0.25), PHYSICAL)
     again = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.simulate(sideways, {**PHYSICAL, 'self_collision': 0.01, 'friction': 1.5})
     other_radius_between = simulator.simulate(sideways, PHYSICAL).chains.tobytes()
-    fresh = BulletSimulator(scene=path, settle_limit=2.0)
+    fresh = BulletSimulator(scene=path, settle_limit=0.5)
     os.remove(path)  # what was read once is not read again
     assert first == again == other_radius_between == fresh.simulate(sideways, PHYSICAL).chains.tobytes()
     simulator.close()

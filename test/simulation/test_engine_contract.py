@@ -149,7 +149,7 @@ def test_a_rope_on_a_table_stays_where_friction_holds_it(make):
     assert np.abs(chain - points).max() < 2e-4
 
 
-@pytest.mark.parametrize('radius', [0.002, 0.005, 0.015])
+@pytest.mark.parametrize('radius', [0.002, 0.015])
 def test_legs_laid_across_each_other_do_not_pass_through(make, radius):
     # A loop: the last leg lies, 6 cm higher, across the first, and falls onto it while it is pulled.
     turn = np.linspace(-np.pi / 2, np.pi, 40)
@@ -394,7 +394,7 @@ def test_random_and_corner_parameter_sets_stay_finite(make):
     """Many of them, free parameters and the fixed ones, over a drag and a fold."""
     simulator = make(settle_limit=1.0)
     generator, count = np.random.default_rng(0), len(PARAMETERS)
-    sets = np.concatenate([generator.integers(0, 2, (40, count)), generator.random((20, count))])
+    sets = np.concatenate([generator.integers(0, 2, (28, count)), generator.random((14, count))])
     if simulator.name == 'bullet':
         sets = sets[::5]  # the same kernels, and far slower
     for k, point in enumerate(sets):

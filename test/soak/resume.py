@@ -80,24 +80,29 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             of_node(place, tally, choose)
         else:
             choice = CHOICES[turn % NODE_TURN % len(CHOICES)]
-            of_fit(place, tally, choose, choice, MOST if amount > SHORT else 1)
+            of_fit(place, tally, choose, choice, *((MOST, 2) if amount > SHORT else (1, 1)))
     return tally
 
 
-def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, Any], most: int) -> None:
-    """Kill `fit` and its resumptions, `most` times, and compare what it writes with one that nobody kills."""
+def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, Any], most: int,
+           workers: int) -> None:
+    """
+    Kill `fit` and its resumptions, `most` times, and compare what it writes with one that nobody kills.
+
+    :param workers: of that one, and at most of the others.
+    """
     session = write_session(folder / 'session', session_messages(bag_types(), 3), {**SMALL, **choice})
     words = ('fit', session, '--seed', choose.randrange(1000), '--json', '--workers')
     out = folder / 'out'
-    # With two processes, as these also simulate points twice that are twice in one batch.
-    whole = live(folder, *words, 2, '--output', folder / 'whole')
+    # Two processes also simulate points twice that are twice in one batch.
+    whole = live(folder, *words, workers, '--output', folder / 'whole')
     expected, kills, told, simulations, slack = contents(folder / 'whole'), 0, 0, 0, 0
     while True:
-        workers = choose.choice((1, 1, 2))
+        here = choose.choice((1, 1, workers))
         limit = choose.uniform(0.2, 1.0) * whole.seconds if kills < most else None
         begun = any((out / name).exists() for name in ('unfinished/evaluations.log', 'result.xml'))
-        again = ('fit', '--resume', out, '--json', '--workers', workers)
-        life = live(folder, *(again if begun else (*words, workers, '--output', out)), limit=limit)
+        again = ('fit', '--resume', out, '--json', '--workers', here)
+        life = live(folder, *(again if begun else (*words, here, '--output', out)), limit=limit)
         tally.tried += 1
         tally.remember(peak=life.peak, silence=0.0)
         finished = 'nothing to resume' in life.err  # the kill before hit a process that had done all
@@ -107,7 +112,7 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
         if life.code != -signal.SIGKILL or limit is None:
             break
         # Each process was simulating an evaluation, and had perhaps finished another just now.
-        kills, slack = kills + 1, slack + 2 * workers * len(toy_trials(3))
+        kills, slack = kills + 1, slack + 2 * here * len(toy_trials(3))
     if life.code != 0:
         tally.died += 1
         print(f'{choice}: exit code {life.code}: {life.err[-800:]}', file=sys.stderr)
