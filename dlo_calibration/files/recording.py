@@ -16,6 +16,7 @@ from functools import lru_cache
 from io import StringIO
 import json
 from pathlib import Path
+from textwrap import indent
 import time
 from typing import Any, BinaryIO, cast, Mapping
 
@@ -148,7 +149,7 @@ class SessionWriter:
             return
         with self._disk():
             self._writer.flush()
-            self._writer.add_metadata('rosbag2', {'serialized_metadata': _yaml(self._metadata())})
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': self._metadata()})
             self._writer.finish()
             self._stream.close()
             self._write_metadata_file()
@@ -191,26 +192,25 @@ class SessionWriter:
              'topic_type_hash': typestore().hash_rihs01(message_type)})
         self._counts[topic, message_type] = 0
 
-    def _metadata(self) -> dict[str, Any]:
-        """Return the metadata in the form of rosbag2_storage's struct BagMetadata, version 9."""
+    def _metadata(self) -> str:
+        """Return the metadata, in YAML, in the form of rosbag2_storage's struct BagMetadata, version 9."""
         # Jazzy writes version 9, and rosbags reads none above it.
         count = sum(self._counts.values())
         times: dict[str, Any] = {
             'duration': {'nanoseconds': self._last - self._first if count else 0},
             'starting_time': {'nanoseconds_since_epoch': self._first}}
-        return {
+        text = _yaml({
             'version': 9, 'storage_identifier': 'mcap', **times, 'message_count': count,
-            'topics_with_message_count': [
-                {'topic_metadata': {
-                    'name': topic, 'type': message_type, 'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_qos(_is_latched(topic))],
-                    'type_description_hash': typestore().hash_rihs01(message_type)},
-                 'message_count': self._counts[topic, message_type]}
-                for topic, message_type in self._channels],
+            'topics_with_message_count': [],
             'compression_format': '', 'compression_mode': '',
             'relative_file_paths': [self.file.name],
             'files': [{'path': self.file.name, **times, 'message_count': count}],
-            'custom_data': {}, 'ros_distro': 'jazzy'}
+            'custom_data': {}, 'ros_distro': 'jazzy'})
+        # YAML takes milliseconds, while the node listens: what it says of a topic is made once.
+        topics = ''.join(f'\n- message_count: {self._counts[key]}\n{_topic_text(*key)}'
+                         for key in self._channels) or ' []'
+        place = '\ntopics_with_message_count:'  # a name has no line break there
+        return text.replace(f'{place} []', f'{place}{topics}')
 
     def _write_metadata_file(self) -> None:
         """Replace metadata.yaml at once, so that it is never incomplete."""
@@ -218,7 +218,7 @@ class SessionWriter:
             return
         # Without waiting for the disk, as the node calls this while it listens.
         with replacing(self.path / METADATA_FILE, fsync=False) as new:
-            new.write_text(_yaml({METADATA_KEY: self._metadata()}) + '\n', encoding='utf-8')
+            new.write_text(f'{METADATA_KEY}:\n{indent(self._metadata(), "  ")}\n', encoding='utf-8')
 
 
 class _Disk:
@@ -258,6 +258,14 @@ def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
 
 def _is_latched(topic: str) -> bool:
     return topic.rsplit('/', 1)[-1] in LATCHED
+
+
+@lru_cache
+def _topic_text(topic: str, message_type: str) -> str:
+    return indent(_yaml({'topic_metadata': {
+        'name': topic, 'type': message_type, 'serialization_format': 'cdr',
+        'offered_qos_profiles': [_qos(_is_latched(topic))],
+        'type_description_hash': typestore().hash_rihs01(message_type)}}), '  ')
 
 
 @lru_cache
