@@ -68,6 +68,7 @@ soak: $(STAMP)
 
 figures: bench
 	@$(PYTHON) benchmark/searches.py
+	$(PYTHON) benchmark/capture.py
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
 	cp build/experiment/experiment.md benchmark/results/experiment.md
 	for name in $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
@@ -97,5 +98,5 @@ $(STAMP): setup.py
 	  echo 'PyBullet has no binary for this Python: it is compiled now, which takes about four minutes more.'
 	fi
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable $(REQUIREMENTS)
-	$(PYTHON) -c 'import dlo_calibration.simulation.kernels'  # compiles them, once for all processes of a test
+	$(PYTHON) -c 'import dlo_calibration.capture.path, dlo_calibration.simulation.kernels'  # compiles them, once for all processes of a test
 	touch $@

@@ -28,7 +28,7 @@ ONLY = {
     'pybullet': ('simulation/bullet.py',),
     'cv2': ('capture',),
     'PIL': ('capture',),
-    'numba': ('simulation/kernels.py',),
+    'numba': ('simulation/kernels.py', 'capture/path.py'),
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
