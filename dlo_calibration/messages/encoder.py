@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Sequence, Union
 
@@ -13,7 +14,7 @@ import numpy as np
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.messages.trial_builder import order
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
 
 BEFORE = NANOSECONDS // 100  # from the chain that gives a velocity to the initial chain
@@ -24,8 +25,10 @@ def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Union[ChainMe
     Return messages from which a `TrialCollector` makes the same trials, to a nanosecond.
 
     A hand that keeps holding the DLO during a later action takes part in it, at rest.
-    Two cases cannot be sent, and are lost: two hands that grip one point of a chain, and
-    a hand that closes far from its point in the latest chain before the action.
+    Three cases cannot be sent, and are lost: two hands that grip one point of a chain, a
+    hand that closes far from its point in the latest chain before the action, where other
+    hands act alone between that chain and the action, and a hand that holds the DLO in a goal,
+    but moved beyond the beginning of another hand's last action.
     """
     found: list[Union[ChainMessage, ActionMessage]] = []
     zero = 1_700_000_000 * NANOSECONDS  # a time in 2023, as real stamps are
@@ -40,8 +43,7 @@ def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage
     def at(time: float) -> int:
         return zero + round(time * NANOSECONDS)
 
-    groups = _groups(trial)
-    initial = _annotated(trial.initial, groups[0], [hand.name for hand in groups[0]])
+    groups, initial = _numbered(trial, _groups(trial))
     found: list[Union[ChainMessage, ActionMessage]] = []
     if trial.velocity is None:
         found.append(ChainMessage(INITIAL, zero - BEFORE, frame_id, initial))
@@ -75,6 +77,47 @@ def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
         found.append((*hands, *(_at_rest(hand, start, end) for hand in holding
                                 if hand.end <= start and hand.name not in names)))
     return found
+
+
+def _numbered(trial: Trial, groups: list[tuple[Hand, ...]]) -> tuple[list[tuple[Hand, ...]], Chain]:
+    """
+    Return the groups, with their hands in the order to send, and the initial chain with numbers of hands.
+
+    The numbers are those of the first group where this tells the grips of all groups before the first goal.
+    Else only those grips get a number that the place of the hand does not tell.
+    """
+    initial, first_goal = trial.initial, min(goal.time for goal in trial.goals)
+    early = [hands for hands in groups if hands[0].start <= first_goal]
+    annotated = _annotated(initial, groups[0], [hand.name for hand in groups[0]])
+    if all(_tells(annotated, hands) for hands in early):
+        return groups, annotated
+    needed = Counter(hand.grips for hands in early for hand in hands if not _tells_by_place(initial, hand))
+    numbers = np.zeros(len(initial), np.uint8)
+    order = [grips for grips, _ in needed.most_common()]
+    for k, grips in enumerate(order, start=1):
+        numbers[list(grips)] = k
+    renumbered = replace(initial, hands=numbers)
+    place = {grips: k for k, grips in enumerate(order)}
+    sorted_ = [tuple(sorted(hands, key=lambda hand: place.get(hand.grips, len(place)))) for hands in early]
+    if all(_tells(renumbered, hands) for hands in sorted_):
+        return [*sorted_, *groups[len(early):]], renumbered
+    return groups, annotated
+
+
+def _tells(chain: Chain, hands: Sequence[Hand]) -> bool:
+    """Tell whether an annotated chain, and the places of the hands, give the points that hands grip."""
+    for k, hand in enumerate(hands, start=1):
+        held = np.flatnonzero(chain.hands == k)
+        if tuple(held.tolist()) != tuple(sorted(hand.grips)) if len(held) else \
+                not _tells_by_place(chain, hand):
+            return False
+    return True
+
+
+def _tells_by_place(chain: Chain, hand: Hand) -> bool:
+    """Tell whether a hand closes at the one point of a chain that it grips."""
+    distances = np.linalg.norm(chain.points - hand.positions[0], axis=1)
+    return hand.grips == (int(distances.argmin()),) and bool(distances.min() <= MINIMUM_SPACING)
 
 
 def _at_rest(hand: Hand, start: float, end: float) -> Hand:

@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 
 RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
+STACKED = 0.0015  # m; of two strands that cross, one that is so much higher lies on the other
+RISEN = 0.25  # share of its height above the other strand from which on the upper one keeps its height
 
 
 def resting_level(trial: Trial, table_height: float) -> float | None:
@@ -39,8 +42,39 @@ def rest_on(points: Floats, level: float) -> Floats:
 
     These are the points below the level, or above it by less than half of RESTING_BAND:
     a simulation then starts with no point inside the table, and none that falls onto it.
+    A part that lies on another part of the DLO keeps its height, also if the DLO is thin: a
+    simulation cannot know otherwise which one is above.
     """
     rested = np.array(points)
     resting = rested[:, 2] < level + RESTING_BAND / 2
+    resting &= ~_stacked(points, level) | (rested[:, 2] < level)
     rested[resting, 2] = level
     return rested
+
+
+def _stacked(points: Floats, level: float) -> NDArray[np.bool_]:
+    """
+    Tell which (N, 3) [m] points belong to a part that lies on another part of the DLO, and rises for that.
+
+    It does where its segment is above one of the other's, and at least STACKED higher.
+    """
+    begin, step = points[:-1], np.diff(points, axis=0)
+    here, there = np.triu_indices(len(step), 2)
+    u, v, between = step[here], step[there], begin[there] - begin[here]
+    stacked = np.zeros(len(points), bool)
+    with np.errstate(divide='ignore', invalid='ignore'):  # parallel segments do not cross
+        determinant = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+        s = (between[:, 0] * v[:, 1] - between[:, 1] * v[:, 0]) / determinant
+        t = (between[:, 0] * u[:, 1] - between[:, 1] * u[:, 0]) / determinant
+    for k in np.flatnonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1)):
+        higher = float(between[k, 2] + t[k] * v[k, 2] - s[k] * u[k, 2])
+        if abs(higher) >= STACKED:
+            raised = points[:, 2] > level + abs(higher) * RISEN
+            upper = int(there[k] if higher > 0 else here[k])
+            first, last = upper + 1, upper
+            while first > 0 and raised[first - 1]:
+                first -= 1
+            while last < len(points) - 1 and raised[last + 1]:
+                last += 1
+            stacked[first:last + 1] = True
+    return stacked

@@ -72,3 +72,25 @@ def test_a_tracked_trial_with_two_hands_of_their_own_times_is_the_same_again():
     velocity = np.tile((0.1, -0.2, 0.3), (6, 1))
     trial = Trial('tracked', Chain(POINTS), (Action((left, right)),), goals, velocity)
     assert_same(collected([trial]), [trial])
+
+
+def moved(name, grip, start, to, begin=None):
+    begin = POINTS[grip] if begin is None else begin
+    return Action((Hand(name, (grip,), [start, start + 1.0], [begin, np.add(begin, to)]),))
+
+
+ASIDE = (0, 0.1, 0)
+
+
+@pytest.mark.parametrize('actions, held_by', [
+    ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ()),
+    ([moved('left', 0, 0, ASIDE), moved('left', 5, 3, ASIDE)], ()),
+    ([moved('left', 0, 0, ASIDE), moved('left', 0, 3, ASIDE, POINTS[0] + ASIDE)], ()),
+    ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ('left',)),
+    ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ('left', 'right')),
+    ([moved('left', 0, 0, ASIDE), moved('a', 5, 3, ASIDE), moved('b', 2, 6, ASIDE)], ('left', 'a')),
+], ids=['two hands', 'one hand twice', 'one point twice', 'the first holds', 'both hold', 'three hands'])
+def test_actions_after_each_other_without_a_goal_between_keep_their_grips(actions, held_by):
+    goal = Goal(Chain(POINTS + ASIDE), 8.0, True, held_by)
+    trial = Trial('in turn', Chain(POINTS), tuple(actions), (goal,))
+    assert_same(collected([trial]), [trial])

@@ -158,6 +158,20 @@ def test_points_that_rest_are_put_on_the_level_and_others_are_left():
     assert points[0, 2] == pytest.approx(0.004)  # the given ones stay as they were
 
 
+@pytest.mark.parametrize('diameter', [0.003, 0.008])
+@pytest.mark.parametrize('first_above', [True, False])
+def test_a_strand_that_lies_on_another_keeps_its_height(diameter, first_above):
+    turn = np.linspace(-0.4, 2 * np.pi + 0.4, 61)  # more than a turn, and outwards: it crosses itself once
+    points = np.stack([0.05 * np.sin(turn), 0.05 * np.cos(turn), np.full(61, diameter / 2)], axis=1)
+    points[:, 0] += 0.004 * turn
+    upper = np.arange(8) if first_above else np.arange(53, 61)
+    points[upper, 2] += 0.9 * diameter
+    rested = rest_on(points, diameter / 2)
+    np.testing.assert_array_equal(rested[upper], points[upper])
+    points[upper, 2] = diameter / 2 + 0.001  # noise, not another strand
+    np.testing.assert_array_equal(rest_on(points, diameter / 2)[:, 2], diameter / 2)
+
+
 def test_what_is_annotated_as_feature_belongs_to_the_nodes_beside_it():
     points = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
     marked = Chain(points, features=np.isin(np.arange(11), (0, 3, 10)))
