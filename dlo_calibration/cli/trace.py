@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `trace`: finds a DLO's middle line in one photograph, and with a scale its chain."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.cli.output import print_json, standard_output
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Chain, Floats
+
+if TYPE_CHECKING:  # they load OpenCV, which other verbs do not need
+    from dlo_calibration.capture.photograph import Photograph
+    from dlo_calibration.capture.scale import Scale
+    from dlo_calibration.capture.trace import Trace
+
+TEXT = "find a DLO's middle line in a photograph from a few rough clicks, and with a scale its chain"
+LARGEST_DIAMETER = 0.2  # m
+COUNTS = (3, 10_000)  # of a chain's points
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument('photograph', metavar='PHOTO', type=Path, help='a JPEG or PNG file')
+    parser.add_argument('--points', metavar='"u,v u,v ..."', required=True,
+                        help='two or more pixels along the DLO, in order, from one end to the other')
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument('--scale', metavar='"u,v=x,y ..."',
+                       help='four or more pixels and where they are on the table [m]')
+    scale.add_argument('--board', action='store_true', help='the printed board lies beside the DLO')
+    parser.add_argument('--camera', metavar='FILE', type=Path,
+                        help='YAML of a ROS camera calibration, against lens distortion')
+    parser.add_argument('--count', type=int, default=21, metavar='N',
+                        help='points of the chain (default: 21)')
+    parser.add_argument('--diameter', type=float, metavar='M',
+                        help='of the DLO [m] (default: measured in the photograph)')
+    parser.add_argument('--output', metavar='FILE', type=Path, help='write the chain as .csv or .xml')
+    parser.add_argument('--picture', metavar='FILE.png', type=Path, help='draw the line over the photograph')
+    parser.add_argument('--json', action='store_true', help='print one JSON document')
+
+
+def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """Execute the verb; return the exit code."""
+    from dlo_calibration.capture.chains import axis_of, measured_diameter
+    from dlo_calibration.capture.photograph import read_photograph
+    from dlo_calibration.capture.trace import Tracer
+
+    clicks = np.array([_pair(word, '--points', 'u,v') for word in chosen.points.split()]).reshape(-1, 2)
+    _check(chosen)
+    photograph = read_photograph(chosen.photograph, f'photograph {chosen.photograph}')
+    scale = _scale(chosen, photograph)
+    begin = time.perf_counter()
+    trace = Tracer(photograph.pixels).trace(clicks)
+    seconds = time.perf_counter() - begin
+    chain, diameter, length, shown = None, None, None, None
+    if scale is not None:
+        diameter = chosen.diameter or measured_diameter(trace, scale)
+        above = {k: one.first_above for k, one in enumerate(trace.crossings) if one.first_above is not None}
+        axis = axis_of(trace, scale, diameter, chosen.count, above)
+        chain, length = axis.chain(np.linspace(0.0, 1.0, chosen.count)), axis.length
+        shown = scale.to_pixels(chain.points)
+    _write(chosen, photograph, trace, chain, shown)
+    if chosen.json:
+        print_json({'pixels': trace.pixels.tolist(),
+                    'points': None if chain is None else chain.points.tolist(),
+                    'length_m': length, 'width_px': trace.width, 'diameter_m': diameter,
+                    'crossings': [list(one.pixel) for one in trace.crossings], 'sure': trace.sure.tolist(),
+                    'residual_m': None if scale is None else scale.residual,
+                    'notes': [] if scale is None else list(scale.notes), 'seconds': seconds})
+    else:
+        _print(trace, scale, length, diameter)
+    return 0
+
+
+def _check(chosen: argparse.Namespace) -> None:
+    """Refuse values that cannot be meant."""
+    if not COUNTS[0] <= chosen.count <= COUNTS[1]:
+        raise InputError('--count', str(chosen.count), f'{COUNTS[0]} to {COUNTS[1]}', 'choose a number')
+    if chosen.diameter is not None and not 0 < chosen.diameter <= LARGEST_DIAMETER:
+        raise InputError('--diameter', f'{chosen.diameter:g} m', f'above 0, at most {LARGEST_DIAMETER:g} m',
+                         'give it in metres')
+    if chosen.output is not None and not (chosen.scale or chosen.board):
+        raise InputError('--output', 'no scale', 'a chain in metres', 'give --scale or --board')
+
+
+def _scale(chosen: argparse.Namespace, photograph: Photograph) -> Scale | None:
+    """Return the scale that the command line asks for."""
+    from dlo_calibration.capture.board import find_board
+    from dlo_calibration.capture.camera import read_lens
+    from dlo_calibration.capture.pose import scale_from_points
+
+    lens = None if chosen.camera is None else read_lens(chosen.camera)
+    if chosen.board:
+        pixels, table = find_board(photograph.pixels)
+    elif chosen.scale:
+        pairs = [_known_point(word) for word in chosen.scale.split()]
+        pixels, table = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
+    else:
+        return None
+    return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
+
+
+def _known_point(word: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    pixel, equals, place = word.partition('=')
+    if not equals:
+        raise InputError('--scale', repr(word), 'u,v=x,y', 'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
+    return _pair(pixel, '--scale', 'u,v=x,y'), _pair(place, '--scale', 'u,v=x,y')
+
+
+def _pair(word: str, option: str, form: str) -> tuple[float, float]:
+    try:
+        first, second = map(float, word.split(','))
+    except ValueError as error:
+        raise InputError(option, repr(word), f'numbers {form}', 'separate the points by blanks') from error
+    if not max(abs(first), abs(second)) < 1e6:
+        raise InputError(option, repr(word), 'finite numbers below a million', 'correct them')
+    return first, second
+
+
+def _write(chosen: argparse.Namespace, photograph: Photograph, trace: Trace, chain: Chain | None,
+           shown: Floats | None) -> None:
+    """Write the files that the command line asks for."""
+    if chosen.output is not None and chain is not None:
+        from dlo_calibration.files.chain_file import write_chain
+
+        write_chain(chosen.output, chain)
+    if chosen.picture is not None:
+        from dlo_calibration.capture.picture import write_picture
+
+        write_picture(chosen.picture, photograph.pixels, trace, shown)
+
+
+def _print(trace: Trace, scale: Scale | None, length: float | None, diameter: float | None) -> None:
+    """Print what was found, for people."""
+    with standard_output() as stream:
+        crossings = len(trace.crossings)
+        stream.write(f'line of {len(trace.pixels)} pixels, {trace.width:.1f} px wide, sure along '
+                     f'{100 * trace.sure.mean():.0f} %, with {crossings} '
+                     f'crossing{"" if crossings == 1 else "s"}\n')
+        if scale is None or length is None or diameter is None:
+            stream.write('no chain in metres: give --scale or --board\n')
+            return
+        stream.write(f'DLO {1000 * length:.1f} mm long, {1000 * diameter:.1f} mm thick; '
+                     f'scale within {1000 * scale.residual:.2f} mm\n')
+        for note in scale.notes:
+            stream.write(f'{note}\n')

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Chain file: one chain as CSV with rows x,y,z [m], or as an XML document with a point chain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.xml import (
+    add_chain,
+    document,
+    new_root,
+    parse,
+    read_chain,
+    read_octets,
+    write_octets,
+)
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.quantity import exact
+
+WHAT, ROOT = 'chain', 'point_chain'
+MOST_ROWS = 100_000
+LONGEST_ROW = 200  # characters
+
+
+def chain_csv(chain: Chain) -> bytes:
+    """Return a chain as CSV; the annotations are left out."""
+    return ''.join(f'{",".join(map(exact, point))}\n' for point in chain.points.tolist()).encode()
+
+
+def chain_xml(chain: Chain) -> bytes:
+    """Return a chain as an XML document."""
+    holder = new_root('holder')
+    element = add_chain(holder, ROOT, chain, version='1')
+    holder.remove(element)
+    return document(element)
+
+
+def write_chain(path: str | Path, chain: Chain) -> None:
+    """
+    Write a chain to a file: an XML document where its name ends in ``.xml``, else CSV.
+
+    :raises InputError: where the file cannot be written.
+    """
+    write_octets(path, chain_xml(chain) if Path(path).suffix.lower() == '.xml' else chain_csv(chain))
+
+
+def read_chain_file(path: str | Path) -> Chain:
+    """
+    Read a chain from a CSV file or an XML document.
+
+    :raises InputError: where it cannot be read, or is no chain.
+    """
+    where = f'{WHAT} {path}'
+    octets = read_octets(path, WHAT, 'a CSV file with rows x,y,z, or an XML document with a point chain')
+    if Path(path).suffix.lower() == '.xml':
+        return read_chain(where, parse(octets, where, ROOT))
+    rows = []
+    for number, line in enumerate(octets.splitlines(), start=1):
+        text = line[:LONGEST_ROW].decode('utf-8', 'replace').strip()
+        if not text:
+            continue
+        try:
+            x, y, z = map(float, text.split(','))
+        except ValueError as error:
+            raise InputError(f'{where}, line {number}', repr(text), 'a row x,y,z in metres',
+                             'correct the file') from error
+        rows.append((x, y, z))
+        if len(rows) > MOST_ROWS:
+            raise InputError(where, f'more than {MOST_ROWS} rows', 'fewer', 'name the file of one chain')
+    try:
+        return Chain(np.array(rows).reshape(-1, 3))
+    except InputError as error:
+        raise InputError(where, error.came, error.expected, error.remedy) from error
