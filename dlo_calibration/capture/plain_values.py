@@ -114,7 +114,7 @@ class Values:
         return Entry(self._place(name), self.content.get(name, default))
 
     def each(self, name: str, one: str, most: int) -> list[Entry]:
-        """Return the values of a list by its name, each called `one` and its number; none if it is not there."""
+        """Return the values of a list by its name, each called `one` and its number."""
         entries = self.entry(name, []).entries(0, most)
         return [Entry(self._place(f'{one} {number}'), entry.value)
                 for number, entry in enumerate(entries, start=1)]

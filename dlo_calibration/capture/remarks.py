@@ -23,6 +23,7 @@ BESIDE = 0.006  # m; one line lies on the other where they are so near
 STAYED = 0.5  # share of the points, those that moved least, by which the two directions are compared
 REVERSED = 0.4  # times as far as in the given direction; with less, the other direction fits much better
 LET_GO = 0.1  # of the length, between where a hand let a point go and where the goal shows it
+FREE_END = 0.15  # of the length, from an end: there the DLO springs back by centimetres, not millimetres
 CLEARED = 0.8  # of a diameter, by which the upper strand's curve is above the lower one's
 SIZE_OF_A_MOVE = 0.01  # m; points that move less are hardly told from noise
 
@@ -155,6 +156,15 @@ def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float
     for number in moved.unknown:
         remarks.append(Remark('warning', f'Step {number} grips a point that an earlier step may have moved: '
                               'take a photograph between the movements, and make each a trial of its own.'))
+    opened = [(number, step) for number, step in enumerate(entry.steps, start=1)
+              if step.kind in ('grasp_and_place', 'drag') and step.values['to'] is None and not (
+                  set(step.hands) & set(moved.held_by))]
+    for number, step in opened:
+        near_end = not FREE_END < step.values['fraction'] < 1 - FREE_END
+        remarks.append(Remark(
+            'warning' if near_end else 'hint', f'Step {number}: the DLO springs back when the hand opens, so '
+            'the goal does not quite show where that was. Mark the place in the goal photograph, or take it '
+            'while the hand still holds.', 'mark_place'))
     last = {grip: hand for hand in moved.hands for grip in hand.grips}
     for grip, hand in last.items():
         away = float(np.linalg.norm(hand.positions[-1] - chains[1].points[grip]))

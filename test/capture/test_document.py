@@ -28,7 +28,8 @@ FULL = {
         {'kind': 'path', 'hand': 'right_hand', 'fraction': 1.0, 'waypoints': [[0, 0.1, 0.05], [1, 1, 0.0]],
          'speed': 0.2, 'hold': True, 'with_previous': True},
         {'kind': 'two_hands', 'hands': ['a', 'b'], 'fractions': [0.0, 1.0], 'motion': 'apart',
-         'distance': 0.02, 'moving': 'both', 'height': 0.0, 'speed': 0.1, 'hold': True, 'with_previous': False},
+         'distance': 0.02, 'moving': 'both', 'height': 0.0, 'speed': 0.1, 'hold': True,
+         'with_previous': False},
         {'kind': 'release', 'hands': ['right_hand'], 'with_previous': False}]}]}
 
 
