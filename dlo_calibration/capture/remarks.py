@@ -120,6 +120,11 @@ def _reason(start: Axis, goal: Axis, entry: TrialEntry, start_reading: Reading, 
     """Return the likely reason why two lengths differ, and what to do."""
     shorter, longer = (start, goal) if change > 0 else (goal, start)
     which = 'start' if change > 0 else 'goal'
+    for axis, one in ((shorter, which), (longer, 'goal' if which == 'start' else 'start')):
+        count = max(round(AT_THE_END * len(axis.sure)), 1)
+        if not axis.sure[:count].any() or not axis.sure[-count:].any():
+            return f'Probably an end of the DLO was not found in the {one} photograph, where the line is ' \
+                'not sure: check both ends.'
     for end, name in ((slice(None, 1), 'first'), (slice(-1, None), 'last')):
         tip = shorter.points[end]
         gaps = np.linalg.norm(longer.points - tip, axis=1)
@@ -128,11 +133,6 @@ def _reason(start: Axis, goal: Axis, entry: TrialEntry, start_reading: Reading, 
         if gaps.min() < BESIDE and LENGTHS / 2 * longer.length < missing < longer.length / 4:
             return f'The line in the {which} photograph probably ends too early at its {name} end: put the ' \
                 'click at the end of the DLO.'
-    for axis, one in ((shorter, which), (longer, 'goal' if which == 'start' else 'start')):
-        count = max(round(AT_THE_END * len(axis.sure)), 1)
-        if not axis.sure[:count].any() or not axis.sure[-count:].any():
-            return f'Probably an end of the DLO was not found in the {one} photograph, where the line is ' \
-                'not sure: check both ends.'
     if any(step.kind == 'two_hands' and step.values['motion'] == 'apart' and step.values['hold']
            for step in entry.steps) and 0 < change < 0.1:
         return 'Probably the hands stretch it: that is what this action shows. Else check both scales.'

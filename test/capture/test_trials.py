@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Two photographs and the steps of the hands become a trial, or say what is missing or wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from views import curve, DIAMETER, loop, SIZE, traced, view
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.capture.chains import axis_of
+from dlo_calibration.capture.document import PhotographEntry, SameScale, TrialEntry
+from dlo_calibration.capture.interpretation import Interpretation
+from dlo_calibration.capture.plain_values import Values
+from dlo_calibration.capture.readings import Reading
+from dlo_calibration.capture.saving import write_request, write_session
+from dlo_calibration.capture.steps import Step
+from dlo_calibration.capture.trials import read_trial
+from dlo_calibration.files.request import read_request, request_trials
+from dlo_calibration.files.session import read_session
+
+START, GOAL = curve(), curve(1.1, 0.3)
+COUNT = 21
+SCALE = view(0.5)
+
+
+def reading(points, scale=SCALE, crossings=(), above=None, sure=None, **entry):
+    trace = traced(points, scale, crossings)
+    if sure is not None:
+        trace = replace(trace, sure=sure(len(trace.pixels)))
+    axis = axis_of(trace, scale, DIAMETER, COUNT, above)
+    return Reading(PhotographEntry('aaaaaaaa', **entry), SIZE, scale=scale, trace=trace, axis=axis,
+                   above=above or {}, answered=frozenset(above or {}), count=COUNT)
+
+
+def step(kind, **values):
+    return Step.of(Values('step', {'kind': kind, **values}))
+
+
+def read(*steps, start=START, goal=GOAL, **entry):
+    """Return the trial of two curves [m], or of two readings."""
+    start, goal = (one if isinstance(one, Reading) else reading(one) for one in (start, goal))
+    return read_trial(1, TrialEntry('start', 'goal', steps=steps, **entry), {'start': start, 'goal': goal})
+
+
+def remedies(found):
+    return {one.remedy for one in found.remarks if one.remedy not in (None, 'mark_place')}
+
+
+def on_curve(points, fraction):
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return np.array([np.interp(fraction * along[-1], along, axis) for axis in points.T])
+
+
+def test_a_dragged_point_goes_from_its_place_in_the_start_to_that_in_the_goal():
+    found = read(step('drag', fraction=0.33, speed=0.2))
+    trial, (hand,) = found.trial, found.trial.hands
+    assert [len(trial.initial), len(trial.goals[0].chain)] == [COUNT, COUNT]
+    np.testing.assert_allclose(hand.positions, [on_curve(START, 0.33), on_curve(GOAL, 0.33)], atol=2e-4)
+    np.testing.assert_array_equal(trial.initial.points[hand.grips[0]], hand.positions[0])
+    assert hand.end == pytest.approx(np.linalg.norm(hand.positions[1] - hand.positions[0]) / 0.2)
+    assert trial.goals[0].stable
+    assert trial.goals[0].held_by == ()
+    gaps = np.diff(trial.initial.arc_lengths())
+    assert gaps.max() / gaps.min() < 1.2  # a point at the grip, and evenly spaced all the same
+
+
+def test_the_page_draws_the_hand_where_the_photographs_show_it():
+    found = read(step('drag', fraction=0.0, to=[0.1, 0.2]))
+    drawn, = found.plain['hands']
+    np.testing.assert_allclose(drawn['grip'], SCALE.to_pixels(START[:1])[0], atol=0.5)
+    np.testing.assert_allclose(drawn['opens'], SCALE.to_pixels([[0.1, 0.2, DIAMETER / 2]])[0], atol=0.1)
+    assert len(drawn['times']) == len(drawn['start_pixels']) == len(drawn['goal_pixels']) == 2
+
+
+def test_each_kind_of_step_moves_its_hand():
+    rest = DIAMETER / 2
+    hand, = read(step('grasp_and_place', fraction=1.0, to=[0.2, 0.1], height=0.07)).trial.hands
+    np.testing.assert_allclose(hand.positions[1:], [
+        [*hand.positions[0][:2], rest + 0.07], [0.2, 0.1, rest + 0.07], [0.2, 0.1, rest]], atol=1e-9)
+    hand, = read(step('path', fraction=1.0, waypoints=[[0, 0.1, 0.05], [0.1, 0.1, 0]])).trial.hands
+    np.testing.assert_allclose(hand.positions[1:], [[0, 0.1, rest + 0.05], [0.1, 0.1, rest]], atol=1e-9)
+    found = read(step('two_hands', fractions=[0.2, 0.8], distance=0.06))
+    left, right = found.trial.hands
+    np.testing.assert_allclose(np.linalg.norm(left.positions[0] - right.positions[0])
+                               - np.linalg.norm(left.positions[-1] - right.positions[-1]), 0.06)
+    assert found.trial.goals[0].held_by == ('left_hand', 'right_hand')
+    assert [one['opens'] for one in found.plain['hands']] == [None, None]
+
+
+LIFT = step('lift_and_hold', fraction=0.0, height=0.1)
+RELEASE = step('release', hands=['left_hand'])
+RIGHT = step('drag', hand='right_hand', fraction=1.0)
+
+
+def test_a_hand_that_holds_stays_until_it_opens():
+    found = read(LIFT, RIGHT, RELEASE)
+    left, right = found.trial.hands
+    assert left.end > right.end > right.start > 1.0
+    np.testing.assert_array_equal(left.positions[-1], left.positions[-2])
+    assert found.trial.goals[0].held_by == ()
+
+
+def test_steps_of_two_hands_can_begin_together():
+    found = read(step('drag', fraction=0.0), replace(RIGHT, with_previous=True))
+    assert [hand.start for hand in found.trial.hands] == [0.0, 0.0]
+    assert [hand.grips for hand in found.trial.hands] == [(0,), (COUNT - 1,)]
+    one_after_the_other = read(step('drag', fraction=0.0), RIGHT)
+    left, right = one_after_the_other.trial.hands
+    assert right.start > left.end
+    assert any('Step 2 grips a point' in one.text for one in one_after_the_other.remarks)
+
+
+def test_a_hand_that_goes_on_from_where_it_was_is_one_way():
+    found = read(step('path', fraction=0.5, waypoints=[[0, 0.1, 0.05]], hold=True),
+                 step('path', fraction=0.5, waypoints=[[0.1, 0.1, 0]]))
+    hand, = found.trial.hands
+    assert len(hand.times) == 4  # it waits between both
+
+
+@pytest.mark.parametrize('steps, text', [
+    ([RELEASE], 'step 1, hand left_hand'),
+    ([step('two_hands', fractions=[0.5, 0.5])], 'step 1, two_hands'),
+    ([step('drag', fraction=0.5, hold=True), step('drag', hand='right', fraction=0.5)], 'step 2, hand right'),
+    ([step('drag', fraction=0.5, hold=True), replace(step('drag', fraction=0.2), with_previous=True)],
+     'step 2, hand left'),
+    ([step('two_hands', fractions=[0.4, 0.6], distance=0.5)], 'step 1, action two_hands'),
+])
+def test_steps_that_contradict_each_other_are_told(steps, text):
+    found = read(*steps)
+    assert found.trial is None
+    refused, = (one.text for one in found.remarks if one.level == 'error')
+    assert text in refused
+
+
+@pytest.mark.parametrize('steps', [
+    [LIFT], [step('two_hands', height=0.05)], [step('path', waypoints=[[0, 0, 0.1]], hold=True)]])
+def test_a_goal_in_the_air_needs_a_second_photograph(steps):
+    found = read(*steps)
+    assert found.trial is None
+    assert 'add_side' in remedies(found)
+
+
+def test_a_goal_that_is_traced_from_the_other_end_is_pointed_out():
+    moved = START.copy()
+    moved[300:, 1] += np.linspace(0, 0.05, 100)
+    assert remedies(read(RIGHT, goal=moved)) == set()
+    assert remedies(read(RIGHT, goal=moved[::-1])) == {'reverse_goal'}
+
+
+UNSURE_END = reading(curve(1.1, 0.3, 0.48), sure=lambda count: np.arange(count) > 0.05 * count)
+LENGTHS = {
+    'the camera moved': (reading(curve(1.1, 0.3, 0.52), scale=SCALE, name='b'), 'camera moved'),
+    'another scale': (reading(curve(1.1, 0.3, 0.52)), 'scale is wrong'),
+    'the line ends too early': (reading(START[:-20]), 'ends too early at its last end'),
+    'it begins too late': (reading(START[20:]), 'ends too early at its first end'),
+    'an end is not sure': (UNSURE_END, 'an end of the DLO was not found in the goal'),
+}
+
+
+@pytest.mark.parametrize('goal, reason', LENGTHS.values(), ids=LENGTHS)
+def test_a_length_that_differs_has_a_likely_reason(goal, reason):
+    if reason == 'camera moved':
+        goal = replace(goal, entry=replace(goal.entry, scale=SameScale('aaaaaaaa')))
+    found = read(step('drag', fraction=0.5), goal=goal)
+    told, = (one.text for one in found.remarks if one.remedy == 'check_length')
+    assert reason in told
+    assert found.trial is not None
+
+
+def test_lengths_that_differ_little_are_no_remark():
+    assert remedies(read(step('drag', fraction=0.5), goal=curve(1.1, 0.3, 0.505))) == set()
+
+
+def test_who_is_above_is_asked_until_it_is_answered():
+    points, pair = loop()
+    open_, answered = (reading(points, crossings=[pair], above=above) for above in (None, {0: True}))
+    assert remedies(read(RIGHT, start=open_, goal=answered)) == {'ask_crossings'}
+    found = read(RIGHT, start=answered, goal=answered)
+    assert remedies(found) == set()
+    assert found.trial.initial.points[:, 2].max() > 1.5 * DIAMETER
+
+
+@pytest.mark.parametrize('change, remedy', [
+    ({'scale': None, 'axis': None}, 'set_scale'), ({'scale_problem': 'no board', 'axis': None}, 'set_scale'),
+    ({'trace': None, 'axis': None}, 'add_click'), ({'trace_problem': 'no DLO', 'axis': None}, 'add_click')])
+def test_what_is_missing_is_asked_for(change, remedy):
+    found = read(RIGHT, goal=replace(reading(GOAL), **change))
+    assert found.trial is None
+    assert remedies(found) == {remedy}
+    assert found.plain['complete'] is False
+
+
+def test_a_trial_without_goal_or_steps_is_not_complete():
+    found = read_trial(1, TrialEntry('start'), {'start': reading(START)})
+    assert remedies(found) == {'add_goal', 'add_step'}
+    assert found.lengths[0] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_session_and_request_have_the_same_trials(tmp_path):
+    points, pair = loop()
+    start, goal = (reading(points, scale=view(tilt), crossings=[pair], above={0: True}) for tilt in (0.0, 0.2))
+    trials = (read(RIGHT), read(LIFT, RIGHT, RELEASE), read(step('two_hands', fractions=[0.2, 0.8])),
+              read(), read(step('drag', fraction=0.4), start=start, goal=goal))
+    interpretation = Interpretation({'a': reading(START)}, trials, mass=0.03)
+    assert len(interpretation.usable) == 4
+    write_session(tmp_path / 'session.mcap', interpretation.usable, interpretation.options)
+    write_request(tmp_path / 'request.xml', interpretation.usable, interpretation.options)
+    session, request = read_session(tmp_path / 'session.mcap'), read_request(tmp_path / 'request.xml')
+    assert session.problems == request.problems == ()
+    assert session.options == Options.of(request.options) == Options.of(
+        {**interpretation.options, 'workers': 0})
+    assert session.options.mass == 0.03
+    assert session.options.space.physical({}, 0.5)['self_collision'] == pytest.approx(DIAMETER / 2)
+    for found in (session.trials, request_trials(request, session.options)[0]):
+        for one, other in zip(found, interpretation.usable, strict=True):
+            assert (one.name, one.goals[0].time, one.goals[0].held_by) == (
+                other.name, other.goals[0].time, other.goals[0].held_by)
+            pairs = [(one.initial, other.initial), (one.goals[0].chain, other.goals[0].chain)]
+            assert all(np.array_equal(a.points, b.points) for a, b in pairs)
+            for a, b in zip(one.hands, other.hands, strict=True):
+                assert (a.name, a.grips) == (b.name, b.grips)
+                np.testing.assert_array_equal(a.times, b.times)
+                np.testing.assert_array_equal(a.positions, b.positions)
