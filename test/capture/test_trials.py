@@ -174,6 +174,15 @@ def test_lengths_that_differ_little_are_no_remark():
     assert remedies(read(step('drag', fraction=0.5), goal=curve(1.1, 0.3, 0.505))) == set()
 
 
+@pytest.mark.parametrize('fraction, to, hold, level', [
+    (0.0, None, False, 'warning'), (0.4, None, False, 'hint'), (0.0, [0.1, 0.2], False, None),
+    (0.0, None, True, None)])
+def test_where_an_end_was_let_go_should_be_marked(fraction, to, hold, level):
+    found = read(step('drag', fraction=fraction, to=to, hold=hold))
+    levels = [one.level for one in found.remarks if one.remedy == 'mark_place']
+    assert levels == ([] if level is None else [level])
+
+
 def test_who_is_above_is_asked_until_it_is_answered():
     points, pair = loop()
     open_, answered = (reading(points, crossings=[pair], above=above) for above in (None, {0: True}))
@@ -201,7 +210,7 @@ def test_a_trial_without_goal_or_steps_is_not_complete():
 
 def test_session_and_request_have_the_same_trials(tmp_path):
     points, pair = loop()
-    start, goal = (reading(points, scale=view(tilt), crossings=[pair], above={0: True}) for tilt in (0.0, 0.2))
+    start, goal = (reading(points, view(tilt), [pair], {0: True}) for tilt in (0.0, 0.2))
     trials = (read(RIGHT), read(LIFT, RIGHT, RELEASE), read(step('two_hands', fractions=[0.2, 0.8])),
               read(), read(step('drag', fraction=0.4), start=start, goal=goal))
     interpretation = Interpretation({'a': reading(START)}, trials, mass=0.03)

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Exact lines of known curves in photographs that are never made: what a perfect tracer would find."""
+"""Known curves as cameras see them: exact lines, as a perfect tracer finds them, and simple pictures."""
 
 import math
 
+import cv2
 import numpy as np
 
 from dlo_calibration.capture.camera import Lens
@@ -84,3 +85,16 @@ def laid(angles, length, height):
     middles = (steps[1:] + steps[:-1]) / 2
     points = np.concatenate([np.zeros((1, 2)), np.cumsum(middles, axis=0)])
     return np.column_stack([points - points.mean(axis=0), np.full(len(points), height)])
+
+
+def drawn(points, scale, diameter=DIAMETER, seed=1):
+    """Return a photograph (h, w, 3) of a dark DLO with an even colour on a bright table."""
+    trace = traced(points, scale, diameter=diameter)
+    picture = np.full((SIZE[1], SIZE[0], 3), 205, np.uint8)
+    ahead = np.gradient(trace.pixels, axis=0)
+    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    edges = [trace.pixels + side * trace.width / 2 * aside for side in (-1, 1)]
+    outline = np.rint(np.concatenate([edges[0], edges[1][::-1]]) * 16).astype(np.int32)
+    cv2.fillPoly(picture, [outline], (40, 50, 120), cv2.LINE_AA, 4)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, picture.shape)
+    return np.clip(cv2.GaussianBlur(picture, (0, 0), 1.0) + noise, 0, 255).astype(np.uint8)
