@@ -39,7 +39,9 @@ def project(tmp_path):
 
 def again(project):
     project.close()
-    return Project(project.folder)
+    opened = Project(project.folder)
+    opened.close()
+    return opened
 
 
 def test_what_was_done_is_there_when_the_folder_is_opened_again(project):
@@ -142,9 +144,8 @@ DAMAGED = {
 
 @pytest.mark.parametrize('octets', DAMAGED.values(), ids=DAMAGED)
 def test_a_damaged_document_is_kept_aside_and_told(project, octets):
-    project.close()
     (project.folder / 'project.json').write_bytes(octets)
-    opened = Project(project.folder)
+    opened = again(project)
     assert opened.document == Document()
     assert 'project_damaged_1.json' in opened.problems[0]
     assert (project.folder / 'project_damaged_1.json').read_bytes() == octets

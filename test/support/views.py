@@ -12,8 +12,8 @@ from dlo_calibration.capture.camera import Lens
 from dlo_calibration.capture.scale import Scale
 from dlo_calibration.capture.trace import Crossing, Trace
 
-SIZE = (2000, 1500)
-FOCAL_LENGTH = 1500.0
+SIZE = (1200, 900)
+FOCAL_LENGTH = 900.0
 DIAMETER = 0.008
 
 
