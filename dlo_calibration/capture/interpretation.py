@@ -39,7 +39,7 @@ class Interpretation:
     @property
     def diameter(self) -> float | None:
         """Diameter of the DLO [m]; None: neither given nor measured yet."""
-        return next((one.axis.diameter for one in self.photographs.values() if one.axis is not None), None)
+        return next((one.thickness for one in self.photographs.values()), None)
 
     @property
     def options(self) -> dict[str, Any]:

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 import time
-from typing import Any, Callable, Hashable, Mapping, TypeVar, Union
+from typing import Any, Callable, Hashable, Mapping, Sequence, TypeVar, Union
 
 import numpy as np
 
@@ -56,6 +56,8 @@ class Reading:
     :param seconds: that tracing took.
     :param above: index of a crossing -> whether its first strand is above, as answered or else suggested.
     :param answered: indices of the crossings with an answer.
+    :param diameter: of the DLO, as measured in this photograph [m]; `thickness`: as it is used for all.
+    :param axis: of the DLO, if it lies on the table; `axis_problem`: why it cannot.
     :param count: number of points of the chain.
     """
 
@@ -71,7 +73,9 @@ class Reading:
     above: Mapping[int, bool] = field(default_factory=dict)
     answered: frozenset[int] = frozenset()
     diameter: float | None = None
+    thickness: float | None = None
     axis: Axis | None = None
+    axis_problem: str | None = None
     count: int = 21
 
     @cached_property
@@ -144,7 +148,9 @@ class Reader:
             marked = self._scale(entry)
             traced = self._trace(entry)
             found[entry.id] = self._reading(entry, size, marked, traced)
-        diameter = document.dlo.diameter or self._median_diameter(found)
+        sides = {one for trial in document.trials for one in (trial.start_side, trial.goal_side)}
+        diameter = document.dlo.diameter or _median_diameter(
+            [reading for one, reading in found.items() if one not in sides])
         return {one: self._with_axis(reading, diameter) for one, reading in found.items()}
 
     def _attempt(self, what: str, one: str, key: Hashable,
@@ -220,11 +226,6 @@ class Reader:
         return Reading(entry, size, None, scale, scale_problem, own, trace, None, seconds, above, answered,
                        None if isinstance(width, InputError) else width, count=count)
 
-    def _median_diameter(self, readings: Mapping[str, Reading]) -> float | None:
-        """Return the diameter as measured in most photographs, to a tenth of a millimetre [m]."""
-        measured = [one.diameter for one in readings.values() if one.diameter is not None]
-        return max(round(float(np.median(measured)), 4), 1e-4) if measured else None
-
     def _with_axis(self, reading: Reading, diameter: float | None) -> Reading:
         trace, scale = reading.trace, reading.scale
         axis: Union[Axis, InputError, None] = None
@@ -233,16 +234,21 @@ class Reader:
             axis = self._attempt('axis', reading.entry.id, key, lambda: axis_of(
                 trace, scale, diameter, reading.count, reading.above))
         # The same object, with what the page draws of it, as long as nothing changed.
-        whole = reading.entry, reading.scale, trace, axis, reading.scale_problem, reading.count
+        whole = reading.entry, reading.scale, trace, axis, reading.scale_problem, reading.count, diameter
         return self._attempt('reading', reading.entry.id, whole, lambda: _completed(  # type: ignore[return-value]
-            reading, axis))
+            reading, axis, diameter))
 
 
-def _completed(reading: Reading, axis: Union[Axis, InputError, None]) -> Reading:
-    values = {name: getattr(reading, name) for name in Reading.__dataclass_fields__}
+def _completed(reading: Reading, axis: Union[Axis, InputError, None], diameter: float | None) -> Reading:
     if isinstance(axis, InputError):
-        return Reading(**{**values, 'trace_problem': str(axis)})
-    return Reading(**{**values, 'axis': axis})
+        return replace(reading, thickness=diameter, axis_problem=str(axis))
+    return replace(reading, thickness=diameter, axis=axis)
+
+
+def _median_diameter(readings: Sequence[Reading]) -> float | None:
+    """Return the diameter as measured in most photographs, to a tenth of a millimetre [m]."""
+    measured = [one.diameter for one in readings if one.diameter is not None]
+    return max(round(float(np.median(measured)), 4), 1e-4) if measured else None
 
 
 def answers(entry: PhotographEntry, trace: Trace) -> tuple[dict[int, bool], frozenset[int]]:

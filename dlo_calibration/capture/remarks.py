@@ -51,8 +51,12 @@ def error(text: str, remedy: str | None = None) -> Remark:
     return Remark('error', text, remedy)
 
 
-def about_photograph(reading: Reading, which: str) -> list[Remark]:
-    """Return what is missing or doubtful in a photograph, called e.g. `start`."""
+def about_photograph(reading: Reading, which: str, on_table: bool) -> list[Remark]:
+    """
+    Return what is missing or doubtful in a photograph, called e.g. `start`.
+
+    :param on_table: whether the DLO lies on the table in it, wholly.
+    """
     if reading.problem is not None:
         return [error(f'The {which} photograph cannot be read: {reading.problem}')]
     remarks = []
@@ -69,11 +73,13 @@ def about_photograph(reading: Reading, which: str) -> list[Remark]:
                              'add_click'))
     if trace is None:
         return remarks
-    open_ = [k for k in range(len(trace.crossings)) if k not in reading.answered]
+    open_ = [k for k in range(len(trace.crossings)) if k not in reading.answered and on_table]
     if open_:
         where = 'a crossing' if len(open_) == 1 else f'{len(open_)} crossings'
         remarks.append(Remark('warning', f'Say which strand is above at {where} in the {which} photograph; '
                               'until then it is guessed.', 'ask_crossings'))
+    if on_table and reading.axis_problem is not None:
+        remarks.append(error(f'The line in the {which} photograph: {reading.axis_problem}', 'set_scale'))
     unsure = 1.0 - float(trace.sure.mean())
     if unsure > UNSURE:
         remarks.append(Remark('warning', f'The line in the {which} photograph is not sure along '

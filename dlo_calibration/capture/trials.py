@@ -82,10 +82,10 @@ def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading]) -> 
             remarks.append(error('Add a photograph of the DLO after the movement.', 'add_goal'))
         else:
             shown[which] = readings[one]
-            remarks += about_photograph(readings[one], which)
+            remarks += about_photograph(readings[one], which, side is None)
             axis = readings[one].axis
             if side is not None:
-                remarks += about_photograph(readings[side], f'second {which}')
+                remarks += about_photograph(readings[side], f'second {which}', False)
                 axis = _in_space(which, readings[one], readings[side], remarks)
         axes.append(axis)
     lengths = tuple(None if axis is None else axis.length for axis in axes)
@@ -120,11 +120,11 @@ def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading]) -> 
 
 def _in_space(which: str, above: Reading, side: Reading, remarks: list[Remark]) -> Axis | None:
     """Return the axis of a DLO that two photographs of one moment show."""
-    if above.axis is None or above.trace is None or above.scale is None or side.trace is None or (
+    if above.thickness is None or above.trace is None or above.scale is None or side.trace is None or (
             side.scale is None):
         return None
     try:
-        return axis_of_two_views(above.trace, above.scale, side.trace, side.scale, above.axis.diameter)
+        return axis_of_two_views(above.trace, above.scale, side.trace, side.scale, above.thickness)
     except InputError as refusal:
         remarks.append(error(f'The two photographs of the {which} do not give the DLO in space: {refusal}'))
         return None

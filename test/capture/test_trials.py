@@ -32,7 +32,7 @@ def reading(points, scale=SCALE, crossings=(), above=None, sure=None, **entry):
         trace = replace(trace, sure=sure(len(trace.pixels)))
     axis = axis_of(trace, scale, DIAMETER, COUNT, above)
     return Reading(PhotographEntry('aaaaaaaa', **entry), SIZE, scale=scale, trace=trace, axis=axis,
-                   above=above or {}, answered=frozenset(above or {}), count=COUNT)
+                   above=above or {}, answered=frozenset(above or {}), thickness=DIAMETER, count=COUNT)
 
 
 def step(kind, **values):
@@ -141,6 +141,26 @@ def test_a_goal_in_the_air_needs_a_second_photograph(steps):
     found = read(*steps)
     assert found.trial is None
     assert 'add_side' in remedies(found)
+
+
+def test_a_lifted_goal_is_measured_in_two_photographs():
+    hung = GOAL.copy()
+    t = np.clip(1 - np.linspace(0, 1, len(hung)) / 0.3, 0, 1)
+    hung[:, 2] += 0.1 * (4 * t**3 - 3 * t**4)
+    side = view(1.0, 0.4)
+    both = {'start': reading(START)}
+    for name, scale in (('goal', SCALE), ('side', side)):
+        both[name] = replace(reading(GOAL, scale), trace=traced(hung, scale))
+    both['side'] = replace(both['side'], axis=None, axis_problem='above the horizon')
+    found = read_trial(1, TrialEntry('start', 'goal', goal_side='side', steps=(LIFT,)), both)
+    goal = found.trial.goals[0]
+    assert goal.held_by == ('left_hand',)
+    np.testing.assert_allclose(goal.chain.points[0], hung[0], atol=2e-3)
+    np.testing.assert_allclose(found.trial.hands[0].positions[-1], goal.chain.points[0])
+    assert 'add_side' not in remedies(found)
+    too_near = read_trial(1, TrialEntry('start', 'goal', goal_side='goal', steps=(LIFT,)), both)
+    assert too_near.trial is None
+    assert any('degrees' in one.text for one in too_near.remarks if one.level == 'error')
 
 
 def test_a_goal_that_is_traced_from_the_other_end_is_pointed_out():
