@@ -70,11 +70,16 @@ class Interpreter:
     def __init__(self, project: Project) -> None:
         self._project = project
         self._reader = Reader(project)
+        self._known: dict[int, tuple[tuple[object, ...], ReadTrial]] = {}
 
     def interpret(self) -> Interpretation:
         """Return what the present document means."""
         document = self._project.document
         readings = self._reader.readings()
-        trials = tuple(read_trial(number, entry, readings)
-                       for number, entry in enumerate(document.trials, start=1))
+        known, self._known = self._known, {}
+        for number, entry in enumerate(document.trials, start=1):
+            key = entry, *(readings[one] for one in entry.photographs)
+            same = number in known and known[number][0] == key
+            self._known[number] = known[number] if same else (key, read_trial(number, entry, readings))
+        trials = tuple(trial for _, trial in self._known.values())
         return Interpretation(readings, trials, document.dlo.mass)

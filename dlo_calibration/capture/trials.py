@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Sequence
 
 import numpy as np
@@ -47,7 +48,7 @@ class ReadTrial:
     goal: Reading | None = None
     opened: frozenset[str] = frozenset()
 
-    @property
+    @cached_property
     def plain(self) -> dict[str, Any]:
         """What the page draws, as plain values."""
         return {'complete': self.trial is not None, 'remarks': [one.plain() for one in self.remarks],

@@ -4,6 +4,7 @@
 """The verb trace: a photograph and a few clicks give the line, the chain, and files."""
 
 import json
+from pathlib import Path
 import re
 
 import numpy as np
@@ -60,6 +61,8 @@ def test_clicks_and_known_points_give_the_chain(photograph, capsys, tmp_path):
 
 def test_without_a_scale_there_is_only_the_line(photograph, capsys):
     found = traced(capsys, photograph, '--points', words(CLICKS[::-1]))
+    document = (Path(__file__).parents[2] / 'doc/messages.md').read_text(encoding='utf-8')
+    assert [key for key in found if f'`{key}`' not in document] == []
     assert found['points'] is found['length_m'] is None
     np.testing.assert_allclose(found['pixels'][-1], SCALE.to_pixels(POINTS[:1])[0], atol=4)
 

@@ -21,6 +21,7 @@ from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.chain_file import chain_xml, read_chain_file
 from dlo_calibration.files.request import (
     GoalRequest,
     read_request,
@@ -349,13 +350,16 @@ def test_request_that_cannot_be_used_takes_one_line(command, file):
     assert re.fullmatch(r'dlo-calibration: request .*asked.xml, line 4, element <settings>.*\n', errors)
 
 
-def test_examples_of_the_document_are_what_it_says():
+def test_examples_of_the_document_are_what_it_says(tmp_path):
     text = (SAMPLES.parents[1] / 'doc' / 'formats.md').read_text(encoding='utf-8')
-    described, asked = re.findall('```xml\n(.*?)```', text, re.DOTALL)
+    described, asked, chain = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
     found = request_of(asked.encode())
     assert {getattr(action, 'name', None) for trial in found.trials for action in trial.actions} == {
         'lift_and_hold', 'release', None}
+    (tmp_path / 'chain.xml').write_text(chain, encoding='utf-8')
+    read = read_chain_file(tmp_path / 'chain.xml')
+    assert (len(read), chain_xml(read).decode()) == (3, chain)
     assert all(f'`{name}`' in text for name in NAMED_ACTIONS)
 
 
