@@ -21,7 +21,7 @@ from dlo_calibration.capture.pose import scale_from_points
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.scale import Scale
 from dlo_calibration.capture.trace import Trace, Tracer
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import DEFECT, InputError
 from dlo_calibration.model.chain import Chain, Floats
 
 ANSWER_REACH = 3.0  # widths of the DLO between a crossing and the pixel of the answer that belongs to it
@@ -164,6 +164,8 @@ class Reader:
             value = make()
         except InputError as error:
             value = error
+        except Exception as error:  # a defect of this package must not cost the other photographs
+            value = InputError(f'{what} of the photograph', repr(error), 'something that can be used', DEFECT)
         self._known[what, one] = key, value
         return value
 

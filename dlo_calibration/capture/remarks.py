@@ -25,6 +25,7 @@ REVERSED = 0.4  # times as far as in the given direction; with less, the other d
 LET_GO = 0.1  # of the length, between where a hand let a point go and where the goal shows it
 FREE_END = 0.15  # of the length, from an end: there the DLO springs back by centimetres, not millimetres
 CLEARED = 0.8  # of a diameter, by which the upper strand's curve is above the lower one's
+LONGEST = 3600.0  # s that hands may move
 SIZE_OF_A_MOVE = 0.01  # m; points that move less are hardly told from noise
 
 
@@ -159,6 +160,9 @@ def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float
             f'In the goal, {lifted[0]} holds the DLO in the air. One photograph from above cannot show how '
             'it hangs: take a second one of the same moment from the side, or let the hand put it down.',
             'add_side'))
+    if moved.end > LONGEST:
+        remarks.append(error(f'The hands move for {moved.end:.0f} s, which takes too long to simulate: raise '
+                             'their speed.'))
     for number in moved.unknown:
         remarks.append(Remark('warning', f'Step {number} grips a point that an earlier step may have moved: '
                               'take a photograph between the movements, and make each a trial of its own.'))

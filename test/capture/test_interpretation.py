@@ -116,6 +116,17 @@ def test_what_is_wrong_in_one_photograph_leaves_the_other(project, edit, problem
     assert any(start[problem] in one['text'] for one in plain['trials'][0]['remarks'])
 
 
+def test_a_defect_in_one_photograph_leaves_the_others(project, monkeypatch):
+    def trace(self, clicks, **rest):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(readings.Tracer, 'trace', trace)
+    plain = Interpreter(project).interpret().plain()
+    for one in plain['photographs'].values():
+        assert 'ZeroDivisionError' in one['trace_problem']
+        assert one['scale'] is not None
+
+
 def test_a_file_that_became_unreadable_is_told(project):
     one = project.document.photographs[0].id
     project.path(one).write_bytes(b'damaged')

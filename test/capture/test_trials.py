@@ -113,6 +113,12 @@ def test_steps_of_two_hands_can_begin_together():
     assert any('Step 2 grips a point' in one.text for one in one_after_the_other.remarks)
 
 
+def test_hands_that_move_for_hours_are_told():
+    found = read(step('path', fraction=0.5, waypoints=[[0, 99, 0]], speed=0.001))
+    assert found.trial is None
+    assert any('raise their speed' in one.text for one in found.remarks)
+
+
 def test_a_hand_that_goes_on_from_where_it_was_is_one_way():
     found = read(step('path', fraction=0.5, waypoints=[[0, 0.1, 0.05]], hold=True),
                  step('path', fraction=0.5, waypoints=[[0.1, 0.1, 0]]))
