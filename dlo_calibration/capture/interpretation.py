@@ -75,7 +75,7 @@ class Interpreter:
     def interpret(self) -> Interpretation:
         """Return what the present document means."""
         document = self._project.document
-        readings = self._reader.readings()
+        readings = self._reader.readings(document)
         known, self._known = self._known, {}
         for number, entry in enumerate(document.trials, start=1):
             key = entry, *(readings[one] for one in entry.photographs)

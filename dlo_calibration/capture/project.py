@@ -19,6 +19,7 @@ from pathlib import Path
 import secrets
 import stat
 import string
+from threading import Lock
 from typing import Any
 
 from dlo_calibration.capture.camera import Lens, read_lens
@@ -56,6 +57,7 @@ class Project:
         self._problems: list[str] = []
         self.revision = 1
         self._decoded: OrderedDict[str, Photograph] = OrderedDict()
+        self._reading = Lock()
         self.document = self._opened()
         self.lens: Lens | None = None
         self.lens_name: str | None = None
@@ -111,7 +113,8 @@ class Project:
         document = self.document.with_photograph(PhotographEntry(one, name, self._next_scale(photograph)))
         with whole(self.folder / PHOTOGRAPHS / f'{one}{SUFFIXES[octets[:3]]}') as new:
             new.write_bytes(octets)
-        self._keep(one, photograph)
+        with self._reading:
+            self._keep(one, photograph)
         self.change(document, self.revision)
         return one
 
@@ -128,15 +131,17 @@ class Project:
 
     def photograph(self, one: str) -> Photograph:
         """
-        Return a photograph, given by its id.
+        Return a photograph, given by its id; any thread may ask for it.
 
         :raises InputError: where it cannot be read.
         """
-        if one not in self._decoded:
-            entry = self.document.by_id.get(one)
-            self._keep(one, read_photograph(self.path(one), f'photograph {entry.name if entry else one}'))
-        self._decoded.move_to_end(one)
-        return self._decoded[one]
+        with self._reading:
+            found = self._decoded.get(one)
+            if found is None:
+                entry = self.document.by_id.get(one)
+                found = read_photograph(self.path(one), f'photograph {entry.name if entry else one}')
+            self._keep(one, found)
+            return found
 
     def set_lens(self, octets: bytes, name: str) -> None:
         """
@@ -195,6 +200,7 @@ class Project:
 
     def _keep(self, one: str, photograph: Photograph) -> None:
         self._decoded[one] = photograph
+        self._decoded.move_to_end(one)
         while len(self._decoded) > IN_MEMORY:
             self._decoded.popitem(last=False)
 

@@ -14,8 +14,9 @@ from typing import Any, Callable, Hashable, Mapping, Sequence, TypeVar, Union
 import numpy as np
 
 from dlo_calibration.capture.board import find_board
+from dlo_calibration.capture.camera import Lens
 from dlo_calibration.capture.chains import along_line, arc_lengths, Axis, axis_of, measured_diameter
-from dlo_calibration.capture.document import BoardScale, PhotographEntry, PointsScale
+from dlo_calibration.capture.document import BoardScale, Document, PhotographEntry, PointsScale
 from dlo_calibration.capture.grid import grid
 from dlo_calibration.capture.pose import scale_from_points
 from dlo_calibration.capture.project import Project
@@ -131,12 +132,13 @@ class Reader:
 
     def __init__(self, project: Project) -> None:
         self._project = project
+        self._document = project.document  # as it is while it is read
         self._tracers: OrderedDict[str, Tracer] = OrderedDict()
         self._known: dict[tuple[str, str], tuple[Hashable, Any]] = {}
 
-    def readings(self) -> dict[str, Reading]:
-        """Return what is read out of each photograph of the document, by its id."""
-        document = self._project.document
+    def readings(self, document: Document) -> dict[str, Reading]:
+        """Return what is read out of each photograph of a document, by its id."""
+        self._document = document
         ids = {entry.id for entry in document.photographs}
         self._known = {key: value for key, value in self._known.items() if key[1] in ids}
         found = {}
@@ -173,11 +175,11 @@ class Reader:
         return self._project.photograph(one).size
 
     def _scale(self, entry: PhotographEntry) -> Union[Marked, InputError, None]:
-        owner = self._project.document.scale_of(entry)
+        owner = self._document.scale_of(entry)
         if owner.scale is None:
             return None
-        key = owner.scale, self._project.lens
-        made = self._attempt('scale', owner.id, key, lambda: self._marked(owner))
+        lens = self._project.lens
+        made = self._attempt('scale', owner.id, (owner.scale, lens), lambda: self._marked(owner, lens))
         if owner.id != entry.id and not isinstance(made, InputError):
             size = self._attempt('size', entry.id, (), lambda: self._size(entry.id))
             if size != made.scale.size:
@@ -185,7 +187,7 @@ class Reader:
                                   'one of the same camera', 'give this photograph a scale of its own')
         return made
 
-    def _marked(self, owner: PhotographEntry) -> Marked:
+    def _marked(self, owner: PhotographEntry, lens: Lens | None) -> Marked:
         photograph = self._project.photograph(owner.id)
         if isinstance(owner.scale, BoardScale):
             pixels, table = find_board(photograph.pixels, printed=owner.scale.ruler)
@@ -193,8 +195,8 @@ class Reader:
             assert isinstance(owner.scale, PointsScale)
             pixels = np.array([pixel for pixel, _ in owner.scale.points]).reshape(-1, 2)
             table = np.array([place for _, place in owner.scale.points]).reshape(-1, 2)
-        return Marked(scale_from_points(pixels, table, photograph.size, self._project.lens,
-                                        photograph.focal_length), pixels, table)
+        scale = scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
+        return Marked(scale, pixels, table)
 
     def _trace(self, entry: PhotographEntry) -> Union[tuple[Trace, float], InputError, None]:
         if len(entry.clicks) < 2:
@@ -215,9 +217,9 @@ class Reader:
                  traced: Union[tuple[Trace, float], InputError, None]) -> Reading:
         scale_problem = str(marked) if isinstance(marked, InputError) else None
         scale = marked.scale if isinstance(marked, Marked) else None
-        mine = self._project.document.scale_of(entry) is entry
+        mine = self._document.scale_of(entry) is entry
         own = marked if isinstance(marked, Marked) and mine else None
-        count = self._project.document.dlo.points
+        count = self._document.dlo.points
         if traced is None or isinstance(traced, InputError):
             return Reading(entry, size, None, scale, scale_problem, own,
                            trace_problem=None if traced is None else str(traced), count=count)
