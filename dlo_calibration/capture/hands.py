@@ -10,7 +10,7 @@ from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.capture.steps import Step
+from dlo_calibration.capture.steps import Hold, Step
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats
@@ -84,6 +84,11 @@ class _Course:
     def __post_init__(self) -> None:
         self.known = self.start.points.copy()
 
+    def hold(self, name: str, grip: int) -> None:
+        """Let a hand hold a point from the beginning."""
+        self.held[name] = _Path(name, grip, [0.0], [self.known[grip]])
+        self.paths.append(self.held[name])
+
     def conduct(self, step: Step, grips: Sequence[int], begin: float) -> float:
         """Let hands take a step; return when it ends [s]."""
         if step.kind == 'release':
@@ -102,7 +107,9 @@ class _Course:
         end = begin
         for name, grip, (times, positions) in zip(step.hands, grips, ways, strict=True):
             path = self.held.pop(name, None)
-            if path is not None:
+            if path is not None and path.grip != grip and path.times == [begin]:
+                self.paths.remove(path)  # it held from before, and opened before it moved
+            elif path is not None:
                 path.rest_until(begin)
             if path is None or path.grip != grip:
                 path = _Path(name, grip, [begin], [positions[0]])
@@ -156,7 +163,7 @@ class _Course:
 
 
 def movements(steps: Sequence[Step], start: Chain, goal: Chain, grip_of: Callable[[float], int],
-              radius: float, measured_height: bool = False) -> Movements:
+              radius: float, measured_height: bool = False, held: Sequence[Hold] = ()) -> Movements:
     """
     Return the paths of the hands.
 
@@ -166,9 +173,12 @@ def movements(steps: Sequence[Step], start: Chain, goal: Chain, grip_of: Callabl
     :param radius: of the DLO, which lies at this height [m].
     :param measured_height: True: the goal's heights are measured, also where the DLO is lifted; a hand that
         lifts or pushes a point, and holds it, ends there.
+    :param held: the hands that hold the DLO at the start.
     :raises InputError: where the steps contradict each other; its thing begins with the step's number.
     """
     course = _Course(start, goal, radius, measured_height)
+    for one in held:
+        course.hold(one.hand, grip_of(one.fraction))
     begin, end, unknown = 0.0, -PAUSE, []
     for number, step in enumerate(steps, start=1):
         if number == 1 or not step.with_previous:
@@ -182,7 +192,8 @@ def movements(steps: Sequence[Step], start: Chain, goal: Chain, grip_of: Callabl
         except InputError as error:
             raise InputError(f'step {number}, {error.thing}', error.came, error.expected,
                              error.remedy) from error
-    return Movements(tuple(path.hand() for path in course.paths), tuple(course.held), end, tuple(unknown))
+    hands = tuple(path.hand() for path in course.paths)
+    return Movements(hands, tuple(course.held), max(end, 0.0), tuple(unknown))
 
 
 def _of(action: Action) -> list[tuple[Floats, Floats]]:

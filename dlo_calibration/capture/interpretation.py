@@ -12,6 +12,7 @@ from typing import Any, Mapping
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.readings import Reader, Reading
+from dlo_calibration.capture.steps import held_after, Hold
 from dlo_calibration.capture.trials import numbered, read_trial, ReadTrial
 from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.model.trial import Trial
@@ -77,9 +78,13 @@ class Interpreter:
         document = self._project.document
         readings = self._reader.readings(document)
         known, self._known = self._known, {}
+        before: tuple[str | None, tuple[Hold, ...]] = (None, ())  # the last goal, and who holds the DLO there
         for number, entry in enumerate(document.trials, start=1):
-            key = entry, *(readings[one] for one in entry.photographs)
+            held = before[1] if before[0] == entry.start else ()
+            key = entry, held, *(readings[one] for one in entry.photographs)
             same = number in known and known[number][0] == key
-            self._known[number] = known[number] if same else (key, read_trial(number, entry, readings))
+            self._known[number] = known[number] if same else (
+                key, read_trial(number, entry, readings, held))
+            before = entry.goal, held_after(entry.steps, held)
         trials = tuple(trial for _, trial in self._known.values())
         return Interpretation(readings, trials, document.dlo.mass)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from dlo_calibration.capture.chains import Axis
 from dlo_calibration.capture.document import SameScale, TrialEntry
 from dlo_calibration.capture.hands import Movements
 from dlo_calibration.capture.readings import Reading
+from dlo_calibration.capture.steps import Hold
 from dlo_calibration.model.chain import Chain, Floats
 
 LENGTHS = 0.02  # difference of the lengths of start and goal, from which on it is told
@@ -148,6 +149,19 @@ def _reason(start: Axis, goal: Axis, entry: TrialEntry, start_reading: Reading, 
             'the DLO does not lie on the table, and looks longer.'
     return 'Probably a scale is wrong: compare the grid with the table in both photographs; or a part of ' \
         'the DLO does not lie on the table, and looks longer.'
+
+
+def about_held(held: Sequence[Hold], entry: TrialEntry) -> list[Remark]:
+    """Return what should be known about hands that hold the DLO at the start of a trial."""
+    remarks = []
+    for one in held:
+        if one.raised and entry.start_side is None:
+            remarks.append(error(f'At the start, {one.hand} holds the DLO in the air, as in the goal before: '
+                                 'take a second photograph of that moment from the side.', 'add_side'))
+        if not any(one.hand in step.hands for step in entry.steps):
+            remarks.append(Remark('hint', f'{one.hand} holds the DLO at the start, as in the goal before, '
+                                  'and goes on holding it: add a release if it opened.', 'add_step'))
+    return remarks
 
 
 def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float,

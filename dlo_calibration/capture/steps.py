@@ -10,7 +10,7 @@ Most kinds are named actions (`dlo_calibration.model.named_actions`); `path` is 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 from dlo_calibration.capture.plain_values import Entry, Values
 from dlo_calibration.model.action import MAXIMUM_HANDS
@@ -164,6 +164,40 @@ class Step:
         """Return the step as a document has it."""
         return {'kind': self.kind, **{name: _plain(value) for name, value in self.values.items()},
                 'with_previous': self.with_previous}
+
+
+@dataclass(frozen=True)
+class Hold:
+    """
+    A hand that holds the DLO.
+
+    :param fraction: of the length, where it grips.
+    :param raised: whether it holds that point in the air.
+    """
+
+    hand: str
+    fraction: float
+    raised: bool = False
+
+
+def held_after(steps: Sequence[Step], before: Sequence[Hold] = ()) -> tuple[Hold, ...]:
+    """Return which hands hold the DLO after some steps, if those in `before` hold it at first."""
+    held = {one.hand: one for one in before}
+    for step in steps:
+        for name in step.hands:
+            held.pop(name, None)
+        if step.values.get('hold'):
+            held.update({name: Hold(name, fraction, _raises(step))
+                         for name, fraction in zip(step.hands, step.fractions, strict=False)})
+    return tuple(held.values())
+
+
+def _raises(step: Step) -> bool:
+    """Tell whether a step ends with its point in the air."""
+    if step.kind == 'path':
+        return bool(step.values['waypoints']) and step.values['waypoints'][-1][2] > 0
+    return step.kind in ('lift_and_hold', 'push_down') or (
+        step.kind == 'two_hands' and step.values['height'] > 0)
 
 
 def described() -> list[dict[str, Any]]:

@@ -16,7 +16,15 @@ from dlo_calibration.capture.chains import Axis
 from dlo_calibration.capture.document import TrialEntry
 from dlo_calibration.capture.hands import Movements, movements, PAUSE
 from dlo_calibration.capture.readings import numbers, Reading
-from dlo_calibration.capture.remarks import about_axes, about_movements, about_photograph, error, Remark
+from dlo_calibration.capture.remarks import (
+    about_axes,
+    about_held,
+    about_movements,
+    about_photograph,
+    error,
+    Remark,
+)
+from dlo_calibration.capture.steps import Hold
 from dlo_calibration.capture.two_views import axis_of_two_views
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.collector import TrialCollector
@@ -67,12 +75,14 @@ def _pixels(reading: Reading | None, positions: Floats) -> list[Any]:
     return [] if reading is None or reading.scale is None else numbers(reading.scale.to_pixels(positions))
 
 
-def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading]) -> ReadTrial:
+def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading],
+               held: Sequence[Hold] = ()) -> ReadTrial:
     """
     Return the trial that a document describes, or why there is none yet.
 
     :param number: of the trial, from 1.
     :param readings: of all photographs, by id.
+    :param held: the hands that hold the DLO at the start.
     """
     remarks: list[Remark] = []
     axes = []
@@ -96,7 +106,7 @@ def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading]) -> 
     begun = ReadTrial((), lengths=(lengths[0], lengths[1]), start=shown.get('start'), goal=shown.get('goal'))
     if start is None or goal is None:
         return replace(begun, remarks=tuple(remarks))
-    shares = _shares(entry, begun.start.count if begun.start else 21)
+    shares = _shares(entry, held, begun.start.count if begun.start else 21)
     try:
         chains = start.chain(shares), goal.chain(shares)
     except InputError as refusal:
@@ -106,11 +116,12 @@ def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading]) -> 
     if entry.steps:
         try:
             moved = movements(entry.steps, *chains, lambda fraction: int(np.abs(shares - fraction).argmin()),
-                              start.diameter / 2, entry.goal_side is not None)
+                              start.diameter / 2, entry.goal_side is not None, held)
         except InputError as refusal:
             remarks.append(error(f'The steps of the hands contradict each other: {refusal}'))
     if moved is None:
         return replace(begun, remarks=tuple(remarks))
+    remarks += about_held(held, entry)
     remarks += about_movements(moved, chains, start.diameter / 2, entry)
     trial = None
     if not any(one.level == 'error' for one in remarks):
@@ -131,11 +142,12 @@ def _in_space(which: str, above: Reading, side: Reading, remarks: list[Remark]) 
         return None
 
 
-def _shares(entry: TrialEntry, count: int) -> Floats:
+def _shares(entry: TrialEntry, held: Sequence[Hold], count: int) -> Floats:
     """Return the fractions of the length, (count,), at which the chain has points: one at each grip."""
     near = SNAP / (count - 1)
     fixed = [0.0, 1.0]
-    for fraction in sorted(one for step in entry.steps for one in step.fractions):
+    grips = [one for step in entry.steps for one in step.fractions] + [one.fraction for one in held]
+    for fraction in sorted(grips):
         if all(abs(fraction - other) > near for other in fixed) and len(fixed) < count:
             fixed.append(fraction)
     return spread_places(np.sort(np.array(fixed)), count)

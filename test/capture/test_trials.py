@@ -16,7 +16,7 @@ from dlo_calibration.capture.interpretation import Interpretation
 from dlo_calibration.capture.plain_values import Values
 from dlo_calibration.capture.readings import Reading
 from dlo_calibration.capture.saving import write_request, write_session
-from dlo_calibration.capture.steps import Step
+from dlo_calibration.capture.steps import held_after, Step
 from dlo_calibration.capture.trials import read_trial
 from dlo_calibration.files.request import read_request, request_trials
 from dlo_calibration.files.session import read_session
@@ -111,6 +111,33 @@ def test_steps_of_two_hands_can_begin_together():
     left, right = one_after_the_other.trial.hands
     assert right.start > left.end
     assert any('Step 2 grips a point' in one.text for one in one_after_the_other.remarks)
+
+
+def test_a_hand_that_held_in_the_goal_before_holds_at_the_start():
+    held = held_after([step('drag', fraction=0.3, hold=True)])
+    both = {'start': reading(START), 'goal': reading(GOAL)}
+
+    def after(*steps):
+        return read_trial(2, TrialEntry('start', 'goal', steps=steps), both, held)
+
+    trial = after(RIGHT).trial
+    left = next(hand for hand in trial.hands if hand.name == 'left_hand')
+    assert left.start == 0.0
+    assert {hand.name for hand in trial.hands} == {'left_hand', 'right_hand'}
+    np.testing.assert_allclose(left.positions[0], on_curve(START, 0.3), atol=2e-4)
+    assert trial.goals[0].held_by == ('left_hand',)
+    assert 'add_step' in remedies(after(RIGHT))
+    opened = after(RELEASE).trial
+    assert ([hand.name for hand in opened.hands], opened.goals[0].held_by) == (['left_hand'], ())
+    elsewhere, = after(step('drag', fraction=0.8)).trial.hands
+    np.testing.assert_allclose(elsewhere.positions[0], on_curve(START, 0.8), atol=2e-4)
+
+
+def test_a_hand_that_held_in_the_air_needs_a_start_from_the_side():
+    both = {'start': reading(START), 'goal': reading(GOAL)}
+    found = read_trial(2, TrialEntry('start', 'goal', steps=(RELEASE,)), both, held_after([LIFT]))
+    assert found.trial is None
+    assert 'add_side' in remedies(found)
 
 
 def test_hands_that_move_for_hours_are_told():
