@@ -164,9 +164,9 @@ def about_held(held: Sequence[Hold], entry: TrialEntry) -> list[Remark]:
     return remarks
 
 
-def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float,
-                    entry: TrialEntry) -> list[Remark]:
-    """Return what is doubtful about the paths of the hands."""
+def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float, entry: TrialEntry,
+                    held: Sequence[Hold]) -> list[Remark]:
+    """Return what is doubtful about the paths of the hands; those in `held` hold the DLO at the start."""
     remarks = []
     lifted = moved.raised(radius)
     if lifted and entry.goal_side is None:
@@ -191,10 +191,13 @@ def about_movements(moved: Movements, chains: tuple[Chain, Chain], radius: float
             'while the hand still holds.', 'mark_place'))
     last = {grip: hand for hand in moved.hands for grip in hand.grips}
     for grip, hand in last.items():
+        moves = bool((hand.positions != hand.positions[0]).any())
+        if not moves and any(one.hand == hand.name for one in held):
+            continue  # it held the DLO before, and only opens, or goes on holding
         away = float(np.linalg.norm(hand.positions[-1] - chains[1].points[grip]))
         if away > LET_GO * chains[0].length:
             remarks.append(Remark('warning', f'{hand.name} ends {1000 * away:.0f} mm away from where the '
                                   'goal shows the point that it gripped: check where it gripped and let go.'))
-        if len(hand.times) == 1:
+        if not moves:
             remarks.append(Remark('hint', f'{hand.name} does not move.'))
     return remarks

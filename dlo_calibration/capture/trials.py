@@ -122,7 +122,7 @@ def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading],
     if moved is None:
         return replace(begun, remarks=tuple(remarks))
     remarks += about_held(held, entry)
-    remarks += about_movements(moved, chains, start.diameter / 2, entry)
+    remarks += about_movements(moved, chains, start.diameter / 2, entry, held)
     trial = None
     if not any(one.level == 'error' for one in remarks):
         trial = _recorded(f'trial {number}', chains, moved, remarks)

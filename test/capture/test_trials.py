@@ -127,6 +127,7 @@ def test_a_hand_that_held_in_the_goal_before_holds_at_the_start():
     np.testing.assert_allclose(left.positions[0], on_curve(START, 0.3), atol=2e-4)
     assert trial.goals[0].held_by == ('left_hand',)
     assert 'add_step' in remedies(after(RIGHT))
+    assert not any('left_hand' in one.text for one in after(RELEASE).remarks)
     opened = after(RELEASE).trial
     assert ([hand.name for hand in opened.hands], opened.goals[0].held_by) == (['left_hand'], ())
     elsewhere, = after(step('drag', fraction=0.8)).trial.hands
