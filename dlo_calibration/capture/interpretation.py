@@ -73,6 +73,14 @@ class Interpreter:
         self._reader = Reader(project)
         self._known: dict[int, tuple[tuple[object, ...], ReadTrial]] = {}
 
+    def prepare(self, one: str) -> None:
+        """
+        Prepare what the traces of a photograph, given by its id, need, so that the first click is not slower.
+
+        :raises InputError: where it cannot be read.
+        """
+        self._reader.prepare(one)
+
     def interpret(self) -> Interpretation:
         """Return what the present document means."""
         document = self._project.document

@@ -155,6 +155,14 @@ class Reader:
             [reading for one, reading in found.items() if one not in sides])
         return {one: self._with_axis(reading, diameter) for one, reading in found.items()}
 
+    def prepare(self, one: str) -> None:
+        """
+        Prepare what the traces of a photograph, given by its id, need, so that the first click is not slower.
+
+        :raises InputError: where it cannot be read.
+        """
+        self._tracer(one).prepare()
+
     def _attempt(self, what: str, one: str, key: Hashable,
                  make: Callable[[], Value]) -> Union[Value, InputError]:
         """Return what `make` returns or refuses, made anew only where the key changed."""
@@ -205,13 +213,16 @@ class Reader:
 
     def _traced(self, entry: PhotographEntry) -> tuple[Trace, float]:
         begin = time.perf_counter()
-        if entry.id not in self._tracers:
-            self._tracers[entry.id] = Tracer(self._project.photograph(entry.id).pixels)
+        trace = self._tracer(entry.id).trace(np.array(entry.clicks))
+        return trace, time.perf_counter() - begin
+
+    def _tracer(self, one: str) -> Tracer:
+        if one not in self._tracers:
+            self._tracers[one] = Tracer(self._project.photograph(one).pixels)
             while len(self._tracers) > TRACERS:
                 self._tracers.popitem(last=False)
-        self._tracers.move_to_end(entry.id)
-        trace = self._tracers[entry.id].trace(np.array(entry.clicks))
-        return trace, time.perf_counter() - begin
+        self._tracers.move_to_end(one)
+        return self._tracers[one]
 
     def _reading(self, entry: PhotographEntry, size: tuple[int, int], marked: Union[Marked, InputError, None],
                  traced: Union[tuple[Trace, float], InputError, None]) -> Reading:

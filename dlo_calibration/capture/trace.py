@@ -71,6 +71,10 @@ class Tracer:
     def __init__(self, pixels: NDArray[np.uint8]) -> None:
         self._pixels = np.ascontiguousarray(pixels)
 
+    def prepare(self) -> None:
+        """Prepare what all traces of the photograph need, so that the first one is not slower."""
+        _ = self._levels
+
     @functools.cached_property
     def _levels(self) -> list[Level]:
         return levels(self._pixels)

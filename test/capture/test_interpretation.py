@@ -15,6 +15,7 @@ from dlo_calibration.capture import readings
 from dlo_calibration.capture.document import Document
 from dlo_calibration.capture.interpretation import Interpreter
 from dlo_calibration.capture.project import Project
+from dlo_calibration.errors import InputError
 
 SCALE = view(0.3)
 SHAPES = curve(), curve(1.1, 0.3)
@@ -114,6 +115,24 @@ def test_what_is_wrong_in_one_photograph_leaves_the_other(project, edit, problem
     assert goal['trace'] is not None
     assert plain['trials'][0]['complete'] is False
     assert any(start[problem] in one['text'] for one in plain['trials'][0]['remarks'])
+
+
+def test_what_was_prepared_is_used(project, monkeypatch):
+    made = []
+
+    class Tracer(readings.Tracer):
+        def __init__(self, pixels):
+            made.append(pixels)
+            super().__init__(pixels)
+
+    monkeypatch.setattr(readings, 'Tracer', Tracer)
+    interpreter = Interpreter(project)
+    interpreter.prepare(project.document.photographs[0].id)
+    assert len(made) == 1
+    assert len(interpreter.interpret().usable) == 1
+    assert len(made) == 2
+    with pytest.raises(InputError):
+        interpreter.prepare('aaaaaaaa')
 
 
 def test_a_defect_in_one_photograph_leaves_the_others(project, monkeypatch):
