@@ -9,34 +9,34 @@ import argparse
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-import shutil
 import sys
-from typing import Callable
 
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.plain import plain
-from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.cli.options import given_options
 from dlo_calibration.cli.output import print_json, print_result, tell
+from dlo_calibration.cli.result_files import (
+    EVALUATIONS,
+    file_names,
+    INPUTS,
+    keep_input,
+    REPORT,
+    REQUEST,
+    RESULT,
+    SESSION,
+    write_files,
+)
 from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.cli.unfinished import Unfinished
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.log import EvaluationLog
-from dlo_calibration.files.evaluations import write_evaluations
-from dlo_calibration.files.recording import SessionWriter
-from dlo_calibration.files.result import HOW, read_result, write_result
-from dlo_calibration.files.session import trial_records
+from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.writing import Attempts, make_folder, whole
+from dlo_calibration.writing import make_folder
 
 TEXT = 'find the parameters that explain a session best'
-# Names of the files in the output folder.
-RESULT, SESSION, REPORT, EVALUATIONS = 'result.xml', 'session.mcap', 'report.html', 'evaluations.csv'
-REQUEST = 'request.xml'
-INPUTS = (REQUEST, SESSION)  # that an unfinished calibration keeps
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +69,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if folder is not None:
             make_folder(folder)  # before hours are spent on a search
             unfinished = unfinished or stack.enter_context(Unfinished(folder, INPUTS))
-            log = unfinished.begin(source, chosen.namespace, lambda path: _keep(path, source), tell)
+            log = unfinished.begin(source, chosen.namespace, lambda path: keep_input(path, source), tell)
         stopped = _fit(chosen, source, folder, make_simulator, log)
         if unfinished is not None and not stopped:
             unfinished.remove()
@@ -105,17 +105,13 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
                 raise KeyboardInterrupt(stop.exit_code) from None
         stopped = stop()
         try:
-            attempts = None if folder is None else _write_files(folder, source, result, make_simulator, stop)
+            attempts = None if folder is None else write_files(folder, source, result, make_simulator, stop)
         finally:  # whatever the disk does
             print_result(result, chosen.json, told)
         if attempts is not None:
             attempts.require()
-            tell(f'{", ".join(_files(source))} are in {folder}')
+            tell(f'{", ".join(file_names(source))} are in {folder}')
     return stopped
-
-
-def _files(source: Source) -> list[str]:
-    return [RESULT, *([REQUEST] if source.is_request else []), SESSION, REPORT, EVALUATIONS]
 
 
 def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
@@ -138,68 +134,3 @@ def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
                          warnings=file.warnings, confirmation=file.confirmation)
         print_json({**plain(result), **{name: getattr(file, name) for name in HOW}})
     return 0
-
-
-def _keep(folder: Path, source: Source) -> None:
-    """Write the input of a calibration to a folder, so that it can be read again."""
-    if source.is_request:
-        _copy(source.path, folder / REQUEST)
-    else:
-        _write_session(folder / SESSION, source)
-
-
-def _write_files(folder: Path, source: Source, result: CalibrationResult, make_simulator: SimulatorFactory,
-                 should_stop: Callable[[], bool]) -> Attempts:
-    """Write a result, and the session or request that it was found from, to a folder, as far as possible."""
-    from dlo_calibration.report.page import digests, Origin, repeating_command, write_report
-
-    attempts = Attempts(folder)
-    with attempts.attempt(RESULT):
-        write_result(folder / RESULT, result, source.options.flat())
-    with attempts.attempt(SESSION):
-        _write_session(folder / SESSION, source)
-    if source.is_request:
-        with attempts.attempt(REQUEST):
-            _copy(source.path, folder / REQUEST)
-    with attempts.attempt(EVALUATIONS):
-        write_evaluations(folder / EVALUATIONS, result)
-    with attempts.attempt(REPORT):
-        repeated = REQUEST if source.is_request else SESSION
-        repeatable = [folder / repeated] if repeated in attempts.written else []
-        origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
-                        digests([*_recorded(source.path), *repeatable]),
-                        [*source.session.problems, *source.refusals])
-        slices = sliced(result, source.options, make_simulator, should_stop)
-        write_report(folder / REPORT, result, origin, slices)
-    return attempts
-
-
-def _recorded(path: Path) -> list[Path]:
-    """List the files that hold the messages of a session."""
-    return [path] if path.is_file() else sorted(one for one in path.iterdir()
-                                                if one.suffix in ('.mcap', '.db3', '.zstd'))
-
-
-def _write_session(path: Path, source: Source) -> None:
-    """
-    Write a session as one MCAP file; if it is one already, copy the file.
-
-    For a request, write the messages that a robot would have sent.
-    """
-    files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
-    if len(files) == 1 and files[0].suffix == '.mcap':
-        _copy(files[0], path)
-        return
-    records, options = source.session.records, source.session.recorded
-    if source.is_request:
-        records, options = trial_records(source.trials), source.options.flat()
-    with whole(path) as new, SessionWriter(new, options) as writer:
-        for record in records:
-            writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file, unless it is there already."""
-    if target.is_symlink() or not (target.exists() and target.samefile(source)):
-        with whole(target) as new:
-            shutil.copyfile(source, new)

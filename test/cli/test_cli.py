@@ -26,7 +26,7 @@ from toy_simulator import Deadly, new_toy, ToySimulator
 from dlo_calibration import calibrate
 from dlo_calibration.calibration import stages
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.cli import fit
+from dlo_calibration.cli import fit, result_files
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
@@ -157,7 +157,7 @@ def test_fit_prints_what_it_found_where_the_disk_is_full_by_then(run, session, t
     def full(*_):
         raise InputError('file result.xml', 'No space left on device', 'room for it', 'make room')
 
-    monkeypatch.setattr(fit, 'write_result', full)
+    monkeypatch.setattr(result_files, 'write_result', full)
     code, output, errors = run('fit', session, '--json', '--output', tmp_path / 'out', '--evaluations', 3)
     assert code == 2
     assert 'No space left on device' in errors

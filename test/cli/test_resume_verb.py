@@ -16,15 +16,15 @@ import pytest
 from serial import serial
 from toy_messages import session_messages, write_session
 
-from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
+from dlo_calibration.cli.result_files import EVALUATIONS, REPORT, REQUEST, RESULT, SESSION
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FLAGS = ('--calibrate', 'flexibility', 'friction', '--evaluations', '25', '--seed', '3')
-FINISHED = {fit.RESULT, fit.SESSION, fit.REPORT, fit.EVALUATIONS}
+FINISHED = {RESULT, SESSION, REPORT, EVALUATIONS}
 
 
 @pytest.fixture
@@ -77,11 +77,11 @@ def names(folder):
 
 def told(folder):
     """Return what a folder tells, without the time that it took."""
-    result = (folder / fit.RESULT).read_text(encoding='utf-8')
-    seconds = f'seconds="{read_result(folder / fit.RESULT).seconds!r}"'
+    result = (folder / RESULT).read_text(encoding='utf-8')
+    seconds = f'seconds="{read_result(folder / RESULT).seconds!r}"'
     assert seconds in result
     return [result.replace(seconds, ''), *((folder / name).read_bytes() for name in (
-        fit.SESSION, fit.EVALUATIONS))]
+        SESSION, EVALUATIONS))]
 
 
 def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
@@ -98,11 +98,11 @@ def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
     assert names(out) == FINISHED
     code, output, errors, toy = act('fit', '--resume', out)
     assert (code, output, toy.count) == (0, '', 0)
-    said = f'nothing to resume: the calibration is finished, and its result is {out / fit.RESULT}\n'
+    said = f'nothing to resume: the calibration is finished, and its result is {out / RESULT}\n'
     assert errors == said
     code, output, errors, toy = act('fit', '--resume', out, '--json')
     assert (code, errors, toy.count) == (0, said, 2)  # the trials once, and no search
-    found, file = json.loads(output), read_result(out / fit.RESULT)
+    found, file = json.loads(output), read_result(out / RESULT)
     assert {name: one['value'] for name, one in found['parameters'].items()} == file.values
     assert (found['score'], found['evaluations'], found['seconds']) == (file.score, 25, file.seconds)
     assert (found['stop_reason'], found['warnings']) == (file.stop_reason, list(file.warnings))
@@ -208,7 +208,7 @@ def test_a_request_is_resumed_from_its_copy(tmp_path, act, abandon):
     abandon(30, 'fit', request, '--output', out, *FLAGS, '--workers', 1)
     request.unlink()
     assert act('fit', '--resume', out)[0] == 0
-    assert names(out) == FINISHED | {fit.REQUEST}
+    assert names(out) == FINISHED | {REQUEST}
 
 
 def test_what_cannot_be_simulated_leaves_nothing_to_resume(session, tmp_path, act):

@@ -15,9 +15,10 @@ from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.report.animation import densely, MOST_FRAMES, simulated_motion, write_animation
+from dlo_calibration.report.animation import write_animation
 from dlo_calibration.report.drawing import session_picture, View
 from dlo_calibration.report.figure import blank_figure, SIMULATED
+from dlo_calibration.simulation.motion import densely, MOST_FRAMES, simulated_motion
 from dlo_calibration.simulation.protocol import Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling
 

@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Motion: the simulated course of a trial, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Mapping
+
+import numpy as np
+
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.protocol import Simulator
+
+FRAME_RATE = 10  # 1/s; a GIF stores times in units of 0.01 s
+MOST_FRAMES = 120  # keeps an animation small: a longer motion is shown faster
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    The simulated motion of a trial.
+
+    :param times: (k,) times in the trial [s], increasing.
+    :param chains: (k, n, 3) simulated chains at these times [m].
+    :param ends: (g, n, 3) simulated chains at the goals of the trial [m].
+    """
+
+    times: Floats
+    chains: Floats
+    ends: Floats
+
+
+def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:
+    """Return a trial with additional timed goals, one for each frame; their chains are placeholders."""
+    last = max(max(hand.end for hand in trial.hands) + 1.0, trial.goals[-1].time)
+    taken = {goal.time for goal in trial.goals}
+    count = min(frames, max(2, round(last * FRAME_RATE) + 1))
+    added = []
+    for time in np.linspace(0.0, last, count):
+        if float(time) not in taken:
+            # Between two goals, the hands hold what they hold at the later one, as in the trial itself.
+            following = next((goal for goal in trial.goals if goal.time > time), trial.goals[-1])
+            added.append(Goal(trial.initial, float(time), stable=False, held_by=following.held_by))
+    return replace(trial, goals=(*trial.goals, *added))
+
+
+def simulated_motion(trial: Trial, simulator: Simulator, physical: Mapping[str, float]) -> Motion:
+    """
+    Simulate a trial, and return the motion of the DLO.
+
+    :param physical: parameters by name (SI units).
+    :raises SimulationError: if the rollout diverges.
+    """
+    dense = densely(trial)
+    chains = simulator.simulate(dense, physical).chains
+    asked = {id(goal.chain) for goal in trial.goals}
+    ends = [k for k, goal in enumerate(dense.goals) if id(goal.chain) in asked]
+    # A stable goal is simulated until the DLO rests, which is later than its time.
+    shown = [k for k, goal in enumerate(dense.goals) if not goal.stable]
+    return Motion(np.array([dense.goals[k].time for k in shown]), chains[shown], chains[ends])
