@@ -34,12 +34,13 @@ setup(
     maintainer_email='dlo_calibration@example.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'files/schema/*.xsd', 'report/page.html']},
+    package_data={NAME: ['py.typed', 'capture/page/*', 'files/schema/*.xsd', 'report/page.html']},
     data_files=shared_files(),
     zip_safe=False,
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.
     install_requires=[
+        'aiohttp>=3.8',
         'Jinja2>=3.1',
         'lxml>=5.2',
         'lz4>=4.0',

@@ -24,6 +24,7 @@ SHARED = ('errors', 'signals', 'writing')
 
 #: Where in the package something may be imported, be it at the top of a module or inside a function.
 ONLY = {
+    'aiohttp': ('capture/events.py', 'capture/guard.py', 'capture/server.py'),
     'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
     'pybullet': ('simulation/bullet.py',),
     'cv2': ('capture',),
@@ -36,7 +37,7 @@ ONLY = {
     'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
-NOT_LOADED = ('cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib',
+NOT_LOADED = ('aiohttp', 'cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib',
               'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))

@@ -130,8 +130,8 @@ class LiveInformation:
         space, height = options.space, options.table_height if options.table else None
         best = None if result is None else result.best.point
         examination = None if result is None else result.examination
-        done = _fingerprints(result.trials) if result and examination and examination.regular else []
-        new = [(trial, key) for trial, key in zip(trials, _fingerprints(trials), strict=True)
+        done = fingerprints(result.trials) if result and examination and examination.regular else []
+        new = [(trial, key) for trial, key in zip(trials, fingerprints(trials), strict=True)
                if key not in done]
         if all(key in informations for _, key in new):
             return
@@ -180,7 +180,7 @@ def _result(job: _Job, future: Future[Any]) -> Any:
     raise CancelledError
 
 
-def _fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:
+def fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:
     """Return what distinguishes trials, apart from their names; equal ones are numbered."""
     seen: Counter[bytes] = Counter()
     found = []
