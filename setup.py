@@ -40,7 +40,7 @@ setup(
     python_requires='>=3.11',
     # The lower bounds are what Ubuntu 24.04 ships, so that a Jazzy machine keeps its own packages.
     install_requires=[
-        'aiohttp>=3.8',
+        'aiohttp>=3.9',
         'Jinja2>=3.1',
         'lxml>=5.2',
         'lz4>=4.0',

@@ -84,7 +84,7 @@ class Guard:
         host = request.headers.get('Host', '')
         if not self._is_ours(host):
             raise Refused(403, 'the address of this page has another host; open the one that was printed')
-        token = request.path.split('/')[1].encode('utf-8', 'surrogatepass')
+        token = request.path.lstrip('/').partition('/')[0].encode('utf-8', 'surrogatepass')
         if not hmac.compare_digest(token, self._token):
             raise Refused(404, NOT_FOUND)
         origin = request.headers.get('Origin')
@@ -94,10 +94,10 @@ class Guard:
 
     def _is_ours(self, host: str) -> bool:
         """Tell whether the host of a request is the one that the server listens on."""
-        name, _, port = host.rpartition(':')
+        name, _, port = host.lower().rpartition(':')
         if port != str(self.port):
             return False
-        if name in LOOPBACK or name.strip('[]') == self._host:
+        if name in LOOPBACK or name.strip('[]') == self._host.lower():
             return True
         try:  # where it listens on every address of this machine, no name is accepted: DNS could rebind it
             ipaddress.ip_address(name.strip('[]'))

@@ -65,13 +65,20 @@ async def _serve(session: CaptureSession, host: str, port: int, ready: Callable[
             raise InputError(f'address {host} port {port}', getattr(error, 'strerror', None) or str(error),
                              'one that is free on this machine', 'choose another --port') from error
         guard.port = runner.addresses[0][1]
-        ready(f'http://{"127.0.0.1" if host in ("0.0.0.0", "::") else host}:{guard.port}/{token}/')
+        ready(f'http://{_named(host)}:{guard.port}/{token}/')
         while not should_stop():
             await asyncio.sleep(TICK)
             await _tell(session, events)
     finally:
         events.close()
         await runner.cleanup()
+
+
+def _named(host: str) -> str:
+    """Return an address as it stands in a page's; one that means all of this machine's is none of them."""
+    if host in ('0.0.0.0', '::'):
+        return '127.0.0.1'
+    return f'[{host}]' if ':' in host else host
 
 
 async def _tell(session: CaptureSession, events: Events) -> None:

@@ -100,16 +100,21 @@ class CaptureGraph:
         """Take part in the graph, if that is not so yet."""
         if self._context is not None:
             return
-        import rclpy
-        from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
-        from rclpy.signals import SignalHandlerOptions
+        try:
+            import rclpy
+            from rclpy.context import Context
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.node import Node
+            from rclpy.signals import SignalHandlerOptions
 
-        context = Context()
-        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node('dlo_capture', context=context, enable_rosout=False, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=context)
+            context = Context()
+            rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+            self._node = Node('dlo_capture', context=context, enable_rosout=False,
+                              start_parameter_services=False)
+            self._executor = SingleThreadedExecutor(context=context)
+        except Exception as error:  # parts of ROS may be missing, or its settings wrong
+            raise InputError('ROS', f'{type(error).__name__}: {error}', 'an installation that works',
+                             'source it, and start the page again') from error
         self._executor.add_node(self._node)
         self._context = context
         self._spin(lambda: False, DISCOVERY)
@@ -169,7 +174,7 @@ class CaptureGraph:
             self._node.destroy_subscription(status)
             for one in publishers.values():
                 self._node.destroy_publisher(one)
-        text = f'{len(trials)} trials were sent; {name} had {before} before and has {count} now'
+        text = f'sent {len(trials)}: {name} had {before} trials, and has {count} now'
         return text if count >= before + len(trials) or not refusal else f'{text}; it refused: {refusal}'
 
     def _stamped(self, trials: Sequence[Trial]) -> list[Any]:

@@ -89,7 +89,7 @@ def test_trials_are_sent_to_a_calibrator_in_another_process(ros_environment, tmp
         assert page.refused('POST', 'api/send', {'namespace': '/a b'})[0] == 400
         with child(ros_environment, tmp_path / 'node'):
             said = page.done('POST', 'api/send', {'namespace': 'calibrator'})['text']
-            assert said == '1 trials were sent; /calibrator had 0 before and has 1 now'
+            assert said == 'sent 1: /calibrator had 0 trials, and has 1 now'
             assert page.done('POST', 'api/send', {'namespace': '/calibrator'})['text'].endswith('has 2 now')
 
 
