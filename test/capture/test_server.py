@@ -3,7 +3,7 @@
 
 """The server of the capture page: from photographs to a result by HTTP."""
 
-from contextlib import closing
+from contextlib import closing, ExitStack
 import csv
 import json
 import shutil
@@ -203,15 +203,18 @@ def test_a_calibration_that_fails_says_why(tmp_path):
         assert 'the toy is broken' in state['calibration']['text']
 
 
-def test_open_pages_are_told_what_happens(tmp_path):
-    with served(tmp_path) as page:
-        with urllib.request.urlopen(f'{page.address}api/events', timeout=PATIENCE) as events:
+def test_open_pages_are_told_what_happens_and_that_it_ends(tmp_path):
+    with ExitStack() as stack:
+        with served(tmp_path) as page:
+            address = f'{page.address}api/events'
+            events = stack.enter_context(urllib.request.urlopen(address, timeout=PATIENCE))
             assert events.headers['Content-Type'] == 'text/event-stream'
             page.add(drawn(START))
             while events.readline() != b'event: state\n':
                 pass
             state = json.loads(events.readline().removeprefix(b'data: '))
             assert state == page.state()
+        assert b'event' not in events.read()
 
 
 def test_the_second_of_two_windows_does_not_undo_the_first(tmp_path):
