@@ -20,7 +20,7 @@ from aiohttp import web
 from dlo_calibration.calibration.plain import known
 from dlo_calibration.capture.connections import Connections
 from dlo_calibration.capture.events import Events
-from dlo_calibration.capture.guard import Guard, Refused, REPORT_POLICY
+from dlo_calibration.capture.guard import Guard, LOG, Refused, REPORT_POLICY
 from dlo_calibration.capture.project import OldRevision, Project
 from dlo_calibration.capture.session import CaptureSession
 from dlo_calibration.errors import InputError
@@ -32,6 +32,7 @@ TYPES = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript', '.s
 LARGEST_PHOTOGRAPH = 64 * 2**20  # bytes
 LARGEST_TEXT = 2 * 2**20  # bytes of anything else
 TICK = 0.2  # s between two looks at what happens in the background
+PAUSE = 5.0  # s after a look that failed
 NAME_LENGTH = 255
 
 
@@ -83,8 +84,12 @@ def _named(host: str) -> str:
 
 async def _tell(session: CaptureSession, events: Events) -> None:
     """Tell the open pages what happened in the background."""
-    for name in await asyncio.to_thread(session.tick):
-        events.tell(name, await asyncio.to_thread(getattr(session, name)))
+    try:
+        for name in await asyncio.to_thread(session.tick):
+            events.tell(name, await asyncio.to_thread(getattr(session, name)))
+    except Exception:  # a defect must not end the page, and should not fill the terminal
+        LOG.exception('what happened in the background')
+        await asyncio.sleep(PAUSE)
 
 
 def application(session: CaptureSession, events: Events, guard: Guard, token: str) -> web.Application:

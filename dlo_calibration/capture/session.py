@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 import threading
 from typing import Any, Mapping
@@ -21,7 +22,6 @@ from dlo_calibration.capture.document import Document
 from dlo_calibration.capture.film import film, filmed
 from dlo_calibration.capture.information import Information
 from dlo_calibration.capture.interpretation import Interpretation, Interpreter
-from dlo_calibration.capture.photograph import Photograph
 from dlo_calibration.capture.pictures import Pictures
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.steps import KINDS
@@ -39,6 +39,20 @@ class NotThere(InputError):
     """Something by a name that nothing has."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """
+    What the document means.
+
+    :param trials: in its order, each with a name of its own; None: it is not complete.
+    :param digest: of the trials and their options.
+    """
+
+    found: Interpretation
+    trials: tuple[Trial | None, ...]
+    digest: str
+
+
 class CaptureSession:
     """
     What a person does to a project, and what comes of it; usable from any thread.
@@ -50,27 +64,28 @@ class CaptureSession:
         self.project = project
         self._connections = connections
         self._lock = threading.RLock()
-        self._pictures = Pictures(self._photograph)
+        self._pictures = Pictures(project.photograph)
         self._interpreter = Interpreter(project)
         self._information = Information(connections.make_simulator)
         self._calibrating = Calibrating(project.folder, connections)
         self._films: OrderedDict[str, Motion] = OrderedDict()
         self._film_lock = threading.Lock()
         self._written = 0  # revision of the calibration's files when they were last told
-        self._interpret()
+        self._fresh: list[str] = []  # ids of photographs that nobody has clicked on yet
+        self._newest: _Read | None = None
 
     # What the page draws
 
     def state(self) -> dict[str, Any]:
         """Return all that the page draws."""
         with self._lock:
-            found = self._interpreted.plain()
+            found = self._read.found.plain()
             trials = [{**one, 'information': self._information.plain(_name(k))}
                       for k, one in enumerate(found['trials'])]
             return {'revision': self.project.revision, 'document': self.project.document.plain(),
                     'photographs': found['photographs'], 'trials': trials,
                     'calibration': {**self.calibration(),
-                                    'result': self._calibrating.plain_result(self._digest)},
+                                    'result': self._calibrating.plain_result(self._read.digest)},
                     'lens': self.project.lens_name, 'ros': self._connections.graph is not None,
                     'actions': _ACTIONS, 'folder': str(self.project.folder),
                     'problems': list(self.project.problems)}
@@ -78,7 +93,7 @@ class CaptureSession:
     def calibration(self) -> dict[str, Any]:
         """Return what the page shows of the calibration, without the result."""
         with self._lock:
-            return self._calibrating.plain(self._digest)
+            return self._calibrating.plain(self._read.digest)
 
     def picture(self, identity: str, width: int | None) -> bytes:
         """Return a photograph as a JPEG file, see `Pictures.jpeg`."""
@@ -102,6 +117,7 @@ class CaptureSession:
         """Take a photograph's file; return its id and the state."""
         with self._lock:
             identity = self.project.add_photograph(octets, name)
+            self._fresh.append(identity)
             return {'id': identity, 'state': self._changed()}
 
     def set_lens(self, octets: bytes, name: str) -> dict[str, Any]:
@@ -130,7 +146,7 @@ class CaptureSession:
             self._calibrating.take()
             path = self._write_session(given)
             self._information.pause()
-            self._calibrating.start(path, self._digest)
+            self._calibrating.start(path, self._read.digest)
             return self.state()
 
     def stop(self) -> dict[str, Any]:
@@ -149,11 +165,11 @@ class CaptureSession:
         :raises InputError: where there is no result, no such trial, or no scale.
         """
         with self._lock:
-            trial = dict(enumerate(self._trials())).get(number)
+            trial = dict(enumerate(self._read.trials)).get(number)
             if trial is None:
                 raise InputError(f'film of trial {number + 1}', 'a trial that is not complete',
                                  'a complete trial', 'see what it lacks')
-            scale = self._interpreted.photographs[self._known(identity)].scale
+            scale = self._read.found.photographs[self._known(identity)].scale
             if scale is None:
                 raise InputError('film', 'a photograph without a scale', 'one with a scale',
                                  'give it a scale first')
@@ -217,6 +233,9 @@ class CaptureSession:
         """Take what happened in the background; return what is new: `calibration`, `information`, `state`."""
         with self._lock:
             news = []
+            _ = self._read  # a project that was opened now
+            if self._fresh:
+                self._prepare(self._fresh.pop(0))
             if self._calibrating.take():
                 news.append('calibration' if self._calibrating.busy else 'state')
             if self._calibrating.revision != self._written:
@@ -229,7 +248,7 @@ class CaptureSession:
     def information(self) -> list[dict[str, Any]]:
         """Return what each trial tells, as far as that is known, with its number from 0."""
         with self._lock:
-            return [{'trial': k, **found} for k in range(len(self._interpreted.trials))
+            return [{'trial': k, **found} for k in range(len(self._read.found.trials))
                     if (found := self._information.plain(_name(k))) is not None]
 
     def close(self) -> None:
@@ -243,25 +262,28 @@ class CaptureSession:
     # Its own
 
     def _changed(self) -> dict[str, Any]:
-        self._interpret()
+        self._newest = None
         return self.state()
 
-    def _interpret(self) -> None:
-        self._interpreted: Interpretation = self._interpreter.interpret()
-        trials = self._trials()
-        self._options = self._interpreted.options
-        self._digest = digest(tuple(trials), self._options)
-        complete = [trial for trial in trials if trial is not None]
-        self._information.want(complete, self._full_options({}))
+    @property
+    def _read(self) -> _Read:
+        """What the document means; after a change, it is read when somebody asks."""
+        if self._newest is None:
+            found = self._interpreter.interpret()
+            trials = [None if one.trial is None else replace(one.trial, name=_name(k))
+                      for k, one in enumerate(found.trials)]
+            self._newest = _Read(found, tuple(trials), digest(tuple(trials), found.options))
+            self._information.want([one for one in trials if one is not None], self._options({}))
+        return self._newest
 
-    def _trials(self) -> list[Trial | None]:
-        """Return the trials, named by their numbers; None for one that is not complete."""
-        return [None if one.trial is None else replace(one.trial, name=_name(k))
-                for k, one in enumerate(self._interpreted.trials)]
+    def _prepare(self, identity: str) -> None:
+        """Prepare a photograph, while the person looks at it, for the first click."""
+        with suppress(InputError):
+            self._interpreter.prepare(identity)
 
     def _complete(self) -> tuple[Trial, ...]:
         """Return the complete trials, as a session has them."""
-        trials = self._interpreted.usable
+        trials = self._read.found.usable
         if not trials:
             raise InputError('project', 'no complete trial', 'a start, a goal, and what the hands did',
                              'see what the trials lack')
@@ -269,25 +291,25 @@ class CaptureSession:
 
     def _write_session(self, given: Mapping[str, Any]) -> Path:
         path = self.project.folder / SESSION
-        saving.write_session(path, self._complete(), self._full_options(given).flat())
+        saving.write_session(path, self._complete(), self._options(given).flat())
         return path
 
     def _session_file(self, name: str) -> Path:
         """Write the session or request of the trials as they are now; return its path."""
         shown, found, given = self._calibrating.shown, self._calibrating.found, {}
-        if shown is not None and found is not None and shown.digest == self._digest:
+        if shown is not None and found is not None and shown.digest == self._read.digest:
             given = dict(found.options)  # so that the same numbers follow
         if name == SESSION:
             return self._write_session(given)
         path = self.project.folder / REQUEST
-        saving.write_request(path, self._complete(), self._full_options(given).flat())
+        saving.write_request(path, self._complete(), self._options(given).flat())
         return path
 
-    def _full_options(self, given: Mapping[str, Any]) -> Options:
-        return Options.of({**Options().flat(), **self._options, **self._connections.options, **given})
+    def _options(self, given: Mapping[str, Any]) -> Options:
+        return Options.of({**self._read.found.options, **self._connections.options, **given})
 
     def _chain_file(self, identity: str, kind: str) -> bytes:
-        chain = self._interpreted.photographs[identity].chain
+        chain = self._read.found.photographs[identity].chain
         if chain is None:
             raise InputError('point chain', 'a photograph without a scale or a line', 'both',
                              'give it a scale and click along the DLO first')
@@ -297,10 +319,6 @@ class CaptureSession:
         if name not in self._calibrating.files:
             raise InputError(name, 'no such file yet', 'a result', 'calibrate first')
         return self._calibrating.folder / name
-
-    def _photograph(self, identity: str) -> Photograph:
-        with self._lock:
-            return self.project.photograph(identity)
 
     def _known(self, identity: str) -> str:
         """

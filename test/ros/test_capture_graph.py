@@ -4,6 +4,7 @@
 """The capture page on a ROS graph: photographs from image topics, and trials for a running calibrator."""
 
 from contextlib import contextmanager
+import json
 import threading
 from types import SimpleNamespace
 
@@ -88,8 +89,11 @@ def test_trials_are_sent_to_a_calibrator_in_another_process(ros_environment, tmp
         assert 'another_name' in page.refused('POST', 'api/send', {'namespace': '/another_name'})[1]
         assert page.refused('POST', 'api/send', {'namespace': '/a b'})[0] == 400
         with child(ros_environment, tmp_path / 'node'):
-            said = page.done('POST', 'api/send', {'namespace': 'calibrator'})['text']
-            assert said == 'sent 1: /calibrator had 0 trials, and has 1 now'
+            said = []
+            # Its start may take longer than the page waits for it.
+            page.until(lambda _: said.append(page.ask('POST', 'api/send', {'namespace': 'calibrator'})[::2])
+                       or said[-1][0] == 200, 'the calibrator')
+            assert json.loads(said[-1][1])['text'] == 'sent 1: /calibrator had 0 trials, and has 1 now'
             assert page.done('POST', 'api/send', {'namespace': '/calibrator'})['text'].endswith('has 2 now')
 
 
