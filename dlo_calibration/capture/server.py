@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from functools import partial
 import json
 from pathlib import Path
 import re
 import secrets
+import socket
 from tempfile import TemporaryDirectory
 from typing import Any, Callable
 from urllib.parse import unquote
@@ -34,6 +36,7 @@ LARGEST_TEXT = 2 * 2**20  # bytes of anything else
 TICK = 0.2  # s between two looks at what happens in the background
 PAUSE = 5.0  # s after a look that failed
 NAME_LENGTH = 255
+ELSEWHERE = '192.0.2.1', 9  # an address that no machine has (RFC 5737), but the way to others leads there
 
 
 def serve(project: Project, connections: Connections, *, host: str = '127.0.0.1', port: int = 0,
@@ -76,8 +79,11 @@ async def _serve(session: CaptureSession, host: str, port: int, ready: Callable[
 
 
 def _named(host: str) -> str:
-    """Return an address as it stands in a page's; one that means all of this machine's is none of them."""
+    """Return an address as it stands in a page's; for all of this machine's, the one that others know."""
     if host in ('0.0.0.0', '::'):
+        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(ELSEWHERE)  # sends nothing
+            return str(probe.getsockname()[0])
         return '127.0.0.1'
     return f'[{host}]' if ':' in host else host
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 import sys
 import threading
-from typing import Any, Callable, TYPE_CHECKING
+from typing import Any, Callable, Iterator, TYPE_CHECKING
 import webbrowser
 
 from dlo_calibration.calibration.engines import SimulatorFactory
@@ -31,7 +31,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.writing import Attempts
+from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
     from dlo_calibration.capture.connections import Graph
@@ -82,6 +82,8 @@ def serve_page(chosen: argparse.Namespace, make_simulator: SimulatorFactory,
     if not 0 <= chosen.port <= 65535:
         raise InputError('option port', str(chosen.port), '0 to 65535', 'choose one in that range')
     with ExitStack() as stack:
+        with _no_output_to_choose('name another folder'):
+            make_folder(chosen.folder)
         project = Project(chosen.folder)
         stack.callback(project.close)
         for problem in project.problems:
@@ -174,10 +176,20 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+@contextmanager
+def _no_output_to_choose(remedy: str) -> Iterator[None]:
+    """Give what cannot be written in this block its own remedy: the verb has no --output."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.thing, error.came, error.expected, remedy) from error
+
+
 def _print_board(path: Path, paper: str) -> int:
     """Write the board."""
     from dlo_calibration.capture.board_sheet import write_board
 
-    write_board(path, paper)
+    with _no_output_to_choose('name another file'):
+        write_board(path, paper)
     tell(f'{path}: print it at 100 % (not "fit to page") on {paper}, and check its ruler line')
     return 0

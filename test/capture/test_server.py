@@ -390,7 +390,10 @@ def test_what_it_cannot_use_is_told_in_one_sentence(tmp_path, capsys):
         assert str(port) in refusal_of(capsys, tmp_path / 'one', '--port', port)
     assert '0 to 65535' in refusal_of(capsys, tmp_path / 'one', '--port', 99999)
     (tmp_path / 'file').write_text('x')
-    assert 'file' in refusal_of(capsys, tmp_path / 'file')
+    for words in ((tmp_path / 'file',), ('--print-board', tmp_path / 'file' / 'board.pdf')):
+        refusal = refusal_of(capsys, *words)
+        assert str(tmp_path / 'file') in refusal
+        assert refusal.endswith(('name another folder', 'name another file'))
     assert 'evaluations' in refusal_of(capsys, tmp_path / 'one', '--evaluations', 0)
     with served(tmp_path / 'two'):
         assert 'another capture' in refusal_of(capsys, tmp_path / 'two')
