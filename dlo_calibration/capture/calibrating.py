@@ -173,7 +173,7 @@ class Calibrating:
                     self._notices.append(f'could not be written: {attempts.failure}')
             finally:
                 begun.close(finished=state == DONE)
-        except (DloCalibrationError, OSError) as error:
+        except Exception as error:  # a thread that dies silently would leave the person waiting
             self._notices.append(f'the result could not be written: {reason(error)}')
         self.revision += 1
 
