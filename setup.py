@@ -74,6 +74,7 @@ setup(
         # The search cma_es; rosdep has no key for it.
         'cma_es': ['cma>=4.0'],
         'test': [
+            'axe-playwright-python>=0.1.4',
             'cma>=4.0',
             'colcon-core',
             'colcon-ros',
@@ -81,6 +82,7 @@ setup(
             'hypothesis>=6.98',
             'mcap-ros2-support>=0.6',
             'mypy>=1.14',
+            'playwright>=1.40',  # drives the machine's own Chromium
             'pytest>=7.4',
             'pytest-benchmark>=4.0',
             'pytest-xdist>=3.5',
