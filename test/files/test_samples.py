@@ -86,9 +86,12 @@ def sample_trials(messages):
 
 def test_every_file_is_used():
     known = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
+    known |= {SAMPLES / 'photographs' / name
+              for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
     assert files(SAMPLES) == known | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
     readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
-    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES), *(one.name for one in SESSIONS)):
+    for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES), *(one.name for one in SESSIONS),
+                 'photographs'):
         assert name in readme
 
 

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The sample photographs of msg_samples, with the clicks of somebody who has never seen the truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from photographed_trials import interpreted
+import pytest
+
+from dlo_calibration import calibrate, Options
+from dlo_calibration.calibration.engines import make_simulator
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'msg_samples/photographs'
+CLICKS = json.loads(Path(__file__).with_name('sample_clicks.json').read_text(encoding='utf-8'))
+TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
+
+
+@pytest.fixture(scope='module')
+def interpretation(tmp_path_factory):
+    """Return what the capture page makes of the sample, and the ids of the photographs."""
+    photographs = {name: ((SAMPLE / name).read_bytes(), clicks) for name, clicks in CLICKS.items()}
+    opened = TRUTH['trials'][1]['hand'][-1][:2]  # at the sticker
+    trials = [{'start': 'first.jpg', 'goal': 'second.jpg', 'steps': [{'kind': 'drag', 'fraction': 0.4}]},
+              {'start': 'second.jpg', 'goal': 'third.jpg', 'steps': [
+                  {'kind': 'grasp_and_place', 'fraction': 1.0, 'height': 0.1, 'to': opened}]}]
+    return interpreted(tmp_path_factory.mktemp('sample') / 'project', photographs, trials,
+                       {'mass': TRUTH['mass_kg']})
+
+
+def test_chains_of_the_sample_are_those_of_the_simulated_rope(interpretation):
+    trials = interpretation[0].usable
+    assert len(trials) == 2
+    chains = [trials[0].initial, trials[0].goals[0].chain, trials[1].goals[0].chain]
+    for chain, name in zip(chains, CLICKS, strict=True):
+        away = np.linalg.norm(chain.points - TRUTH['photographs'][name], axis=1)
+        assert away.mean() < 0.001 and away.max() < 0.0025, name
+        assert chain.length == pytest.approx(TRUTH['length_m'], rel=0.005)
+
+
+def test_parameters_of_the_sample_lie_in_their_intervals(interpretation):
+    read, _ = interpretation
+    options = Options.of({**read.options, 'engine': 'compiled', 'workers': 1, 'evaluations': 80})
+    found = calibrate(read.usable, options, make_simulator=make_simulator).parameters
+    for name in ('flexibility', 'friction'):
+        one = found[name]
+        assert one.verdict == 'identifiable'
+        assert one.lower < TRUTH['parameters'][name]['value'] < one.upper
+        assert one.upper - one.lower < 10
