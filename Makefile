@@ -71,7 +71,7 @@ figures: bench
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
 	cp build/experiment/experiment.md benchmark/results/experiment.md
-	for name in $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
+	for name in from_photographs $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
 
 clean:
 	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
