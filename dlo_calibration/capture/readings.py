@@ -27,6 +27,7 @@ from dlo_calibration.model.chain import Chain, Floats
 
 ANSWER_REACH = 3.0  # widths of the DLO between a crossing and the pixel of the answer that belongs to it
 GRID_POINTS = 25  # of a line of the grid that is drawn
+LATTICE = 25, 19  # columns and rows of pixels whose places on the table the page is told
 TRACERS = 3  # kept in memory, each with what it prepared of its photograph
 
 Value = TypeVar('Value')
@@ -100,7 +101,8 @@ class Reading:
                 'grid': [{'pixels': numbers(thinned(line.pixels), 1), 'label': line.label}
                          for line in grid(self.scale)],
                 'pixels': [] if own is None else numbers(own.pixels),
-                'table': [] if own is None else numbers(own.table, 6)}
+                'table': [] if own is None else numbers(own.table, 6),
+                'lattice': _lattice(self.scale)}
 
     def _plain_trace(self) -> dict[str, Any] | None:
         trace = self.trace
@@ -121,6 +123,16 @@ class Reading:
         assert self.axis is not None
         places = np.linspace(0.0, self.axis.length, self.count)
         return np.asarray(np.interp(places, self.axis.along, along))
+
+
+def _lattice(scale: Scale) -> dict[str, Any]:
+    """Return columns and rows of pixels, and where on the table each row of their crossings is [m]."""
+    width, height = scale.size
+    columns, rows = np.linspace(0, width - 1, LATTICE[0]), np.linspace(0, height - 1, LATTICE[1])
+    table = scale.points(np.stack(np.meshgrid(columns, rows), axis=-1))[:, :2].reshape(*LATTICE[::-1], 2)
+    shown = ~np.isnan(table).any(axis=(1, 2))  # rows below the horizon
+    return {'columns': numbers(columns, 2), 'rows': numbers(rows[shown], 2),
+            'table': numbers(table[shown], 6)}
 
 
 class Reader:

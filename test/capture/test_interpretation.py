@@ -86,6 +86,11 @@ def test_photographs_become_a_trial_and_only_what_changed_is_traced_again(projec
     assert [len(one['trace']['chain']) for one in shown] == [21, 21]
     np.testing.assert_allclose(shown[0]['scale']['pixels'], PLACES, atol=0.01)
     assert shown[1]['scale']['pixels'] == []  # they belong to the other photograph
+    for number, one in enumerate(shown):  # with which the page places what is clicked
+        lattice, scale = one['scale']['lattice'], list(found.photographs.values())[number].scale
+        for row in (0, -1):
+            pixels = [(u, lattice['rows'][row]) for u in lattice['columns']]
+            np.testing.assert_allclose(lattice['table'][row], scale.to_table(pixels)[:, :2], atol=1e-5)
     assert plain['trials'][0]['complete'] is True
     assert len(traced) == 2
 

@@ -103,7 +103,7 @@ export function passages(line, crossing, width) {
  * @param {Point[]} to
  * @returns {((point: Point) => Point) | null} the map; null where the points do not determine it
  */
-export function homography(from, to) {
+function homography(from, to) {
   if (from.length < 4) return null;
   const [a, b] = [normalised(from), normalised(to)];
   const normal = Array.from({length: 8}, () => new Array(9).fill(0));
@@ -153,4 +153,57 @@ function solved(rows) {
     }
   }
   return rows.map((row, i) => row[count] / row[i]);
+}
+
+const STEPS = 5; // until the pixel of a place is exact to far below a pixel
+
+/**
+ * Map between pixels of a photograph and places on the table, the distortion of the lens included.
+ *
+ * Between the lattice's points, what the homography lacks is interpolated.
+ *
+ * @param {{columns: number[], rows: number[], table: Point[][]}} lattice where on the table the pixels are
+ * @returns {{table: (pixel: Point) => Point, pixel: (place: Point) => Point} | null} null: nothing of the table is seen
+ */
+export function tableMap({columns, rows, table}) {
+  if (rows.length < 2) return null;
+  const pixels = rows.flatMap((v) => columns.map((u) => [u, v]));
+  const [there, back] = [homography(pixels, table.flat()), homography(table.flat(), pixels)];
+  if (!there || !back) return null;
+  const lacks = rows.map((v, j) =>
+    columns.map((u, i) => {
+      const [x, y] = there([u, v]);
+      return [table[j][i][0] - x, table[j][i][1] - y];
+    }),
+  );
+  const place = ([u, v]) => {
+    const [i, s] = cell(columns, u);
+    const [j, t] = cell(rows, v);
+    const [x, y] = there([u, v]);
+    const above = mixed(lacks[j][i], lacks[j][i + 1], s);
+    const below = mixed(lacks[j + 1][i], lacks[j + 1][i + 1], s);
+    const [a, b] = mixed(above, below, t);
+    return [x + a, y + b];
+  };
+  return {
+    table: place,
+    pixel: (wanted) => {
+      const [u, v] = back(wanted);
+      const pixel = [u, v];
+      for (let k = 0; k < STEPS; k++) {
+        const [p, q] = back(place(pixel));
+        pixel[0] += u - p;
+        pixel[1] += v - q;
+      }
+      return pixel;
+    },
+  };
+}
+
+/** @returns {[number, number]} the piece between sorted values where another lies, and the share of it, 0 to 1 */
+function cell(values, value) {
+  let k = 0;
+  while (k + 2 < values.length && values[k + 1] <= value) k++;
+  const share = (value - values[k]) / (values[k + 1] - values[k]);
+  return [k, Math.min(1, Math.max(0, share))];
 }

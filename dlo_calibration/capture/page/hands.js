@@ -4,7 +4,7 @@
 /** Step 4, hands: what they did between start and goal. */
 
 import {h} from './dom.js';
-import {along, during, homography, nearest} from './geometry.js';
+import {along, during, nearest, tableMap} from './geometry.js';
 import {stepCard} from './hand_fields.js';
 import {HANDS, labelled, letter} from './hand_names.js';
 import {line, traced} from './line.js';
@@ -183,14 +183,9 @@ export class HandsStep {
   /** @returns {{table: Function, pixel: Function} | null} between the table and a photograph of the trial */
   #map(role) {
     const {project, entry} = this.app;
-    let id = entry[role];
-    if (!project.seen(id)?.scale) return null;
-    while (project.photograph(id).scale?.kind === 'same') id = project.photograph(id).scale.photograph;
-    const {scale} = project.seen(id);
-    if (!this.#maps.has(scale)) {
-      const [table, pixel] = [homography(scale.pixels, scale.table), homography(scale.table, scale.pixels)];
-      this.#maps.set(scale, table && pixel ? {table, pixel} : null);
-    }
+    const scale = project.seen(entry[role])?.scale;
+    if (!scale) return null;
+    if (!this.#maps.has(scale)) this.#maps.set(scale, tableMap(scale.lattice));
     return this.#maps.get(scale);
   }
 
