@@ -40,6 +40,8 @@ FIRST_COLOUR = 0.1  # that at first, when only the colours in the very middle of
 FULL = 0.9  # share of the usual strength from which on an edge counts fully
 TURNS = 3  # of straightening the strip anew
 LEAST = 0.4  # mean logarithm of the odds below which a colour says nothing
+LOCAL = 3.0  # half widths, standard deviation of smoothing the local width along the line
+UNSEEN = 0.05  # what the width elsewhere counts there, where edges of the usual strength count 1
 DRIFT = 0.15  # cost of a change of the middle by one offset; that by two is four times as much
 RESAMPLED = 0.35  # widths, standard deviation of smoothing along the line
 
@@ -92,7 +94,14 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, bey
         if turn < TURNS - 1:
             halves = halves * _wider(strip, strength, index)
             line = smoothed(strip.at(strip.offsets[index]), along)
-    return _exact(strip, strength, colours, index, along, table)
+    return _exact(strip, strength, colours, index, along, table, _changes(strip, table, along))
+
+
+def _changes(strip: Strip, table: Singles, along: float) -> Singles:
+    """Return the strength (n, m) of edges between the DLO's colours and the ground's."""
+    smooth = gaussian_filter1d(gaussian_filter1d(odds(table, strip.lab), along, axis=0), 1.0, axis=1)
+    found: Singles = np.abs(np.gradient(smooth, axis=1)).astype(np.float32)
+    return found
 
 
 def prolonged(line: Floats, by: float, width: float) -> Floats:
@@ -171,13 +180,15 @@ def _usual(strip: Strip, strength: Singles) -> float:
     return float(np.median(strength[:, near].max(axis=1)))
 
 
-def _sides(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return the offsets (2, n) of both edges, and their strength (2, n), 1 is usual."""
+def _sides(strip: Strip, strength: Singles, index: NDArray[np.int64],
+           half: float | Floats = 1.0) -> tuple[Floats, Floats]:
+    """Return the offsets (2, n) of both edges near the half widths, and their strength (2, n), 1 is usual."""
     usual = max(_usual(strip, strength), 1e-6)
     near = np.arange(-7, 8)
     offsets, strengths = np.empty((2, len(index))), np.empty((2, len(index)))
     for k, side in enumerate((-1, 1)):
-        around = np.clip(index[:, None] + round(side / STEP) + near, 1, strength.shape[1] - 2)
+        place = index + np.round(side * half / STEP).astype(int)
+        around = np.clip(place[:, None] + near, 1, strength.shape[1] - 2)
         peak = np.take_along_axis(strength, around, axis=1) * np.exp(-0.5 * (near / 5) ** 2)
         best = np.take_along_axis(around, peak.argmax(axis=1)[:, None], axis=1)
         before, here, after = (np.take_along_axis(strength, best + by, axis=1)[:, 0] for by in (-1, 0, 1))
@@ -204,16 +215,25 @@ def _wider(strip: Strip, strength: Singles, index: NDArray[np.int64]) -> Floats:
 
 
 def _exact(strip: Strip, strength: Singles, colours: Singles, index: NDArray[np.int64], along: float,
-           table: Singles) -> Middle:
+           table: Singles, changes: Singles) -> Middle:
     """Place both edges between the offsets, and smooth the middle where they are weak."""
-    (left, right), (left_strength, right_strength) = _sides(strip, strength, index)
+    half = np.ones(len(index))
+    for _ in range(2):
+        (left, right), (left_strength, right_strength) = _sides(strip, strength, index, half)
+        # A rope is wider here and narrower there; without evidence it is as wide as elsewhere.
+        trust = np.minimum(left_strength, right_strength) ** 2
+        widths, trusts = (gaussian_filter1d(values, LOCAL * along, mode='nearest') + UNSEEN
+                          for values in (trust * (right - left) / 2, trust))
+        half = np.clip(widths / trusts, 0.75, 1.4)
     # Where the edges disagree, as with a shadow beside the DLO, the stronger one counts.
     shares = np.column_stack([left_strength, right_strength]) ** 4 + 1e-6
-    middle = (np.column_stack([left + 1, right - 1]) * shares).sum(axis=1) / shares.sum(axis=1)
-    agrees = np.exp(-0.5 * ((right - left - 2) / 0.2) ** 2)
+    middle = (np.column_stack([left + half, right - half]) * shares).sum(axis=1) / shares.sum(axis=1)
+    agrees = np.exp(-0.5 * ((right - left - 2 * half) / 0.25) ** 2)
     around = np.clip(index[:, None] + np.arange(-10, 11), 0, colours.shape[1] - 1)
     inside = np.take_along_axis(colours, around, axis=1).mean(axis=1, dtype=float)
-    both = np.minimum(left_strength, right_strength)
+    # Through a shadow the edge of the colours is seen better than that of the light.
+    (left_seen, right_seen) = _sides(strip, changes, index, half)[1]
+    both = np.minimum(np.maximum(left_strength, left_seen), np.maximum(right_strength, right_seen))
     quality = np.clip(1.4 * both, 0, 1) * agrees * np.clip((inside - LEAST) / 1.2, 0, 1)
     weight = 1e-4 + quality
     sigma = 0.8 * along
