@@ -31,7 +31,7 @@ from dlo_calibration.capture.strip import (
 )
 from dlo_calibration.model.chain import Floats
 
-SPACING = 3.0  # px between stations
+SPACING = 4.0  # px between stations
 HALVES = 0.5 * np.geomspace(0.3, 2.6, 26)  # of the rough width: half widths that are tried
 FAR = 2.6  # half widths: how far the strip reaches beside the line
 STEP = 0.04  # half widths between the offsets
@@ -80,7 +80,7 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, bey
     spacing = max(SPACING, width / 10)
     line = smoothed(evenly(rough, spacing), 0.5 * width / spacing)
     line = prolonged(line, max(beyond, 2.2 * width), width)
-    line, half = _first(pixels, evenly(line, 1.5 * spacing), width, known)
+    line, half = _first(pixels, evenly(line, 2.0 * spacing), width, known)
     spacing = max(SPACING, half / 6)
     halves = np.full(len(line), half)
     for turn in range(TURNS):
