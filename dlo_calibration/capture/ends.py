@@ -20,6 +20,7 @@ from dlo_calibration.capture.strip import lengths, odds, straighten, Strip
 from dlo_calibration.model.chain import Floats
 
 SURE = 0.35  # quality below which the line is not sure
+SEEN = 1.0  # median logarithm of the odds from which on the DLO is not hidden
 BRIDGED = 1.6  # widths: a shorter gap between sure parts is sure, too
 HIDDEN = 1.2  # widths: over a longer gap the line is drawn anew
 CAP = 1.6  # half widths at the end that say nothing about the middle
@@ -47,7 +48,7 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
         end = _end(arc, middle.inside[::order], _passed(way, arc, clicks[::order][0]), near)
         if end is not None:
             line = _extended(way, arc, end, half)[::order]
-    line = _bridged(line, sure, clicks, 2 * half)
+    line = _bridged(line, sure, middle.inside, clicks, 2 * half)
     ends = []
     for order in (1, -1):
         way = line[::order]
@@ -130,14 +131,27 @@ def _extended(line: Floats, arc: Floats, end: float, half: float) -> Floats:
     return found
 
 
-def _bridged(line: Floats, sure: NDArray[np.bool_], clicks: Floats, width: float) -> Floats:
-    """Return a line (n, 2) that is smooth where it is not sure, and goes through clicks there."""
+def _beside_itself(line: Floats, arc: Floats, part: slice, width: float) -> bool:
+    """Tell whether a part of a line (n, 2) lies beside another part of it, or across it."""
+    places = np.arange(len(line))[part]
+    apart = np.abs(arc[places][:, None] - arc) > 3 * width
+    near = np.linalg.norm(line[places][:, None] - line, axis=2) < 1.5 * width
+    return bool((apart & near).any())
+
+
+def _bridged(line: Floats, sure: NDArray[np.bool_], inside: Floats, clicks: Floats,
+             width: float) -> Floats:
+    """Return a line (n, 2) that is smooth where the DLO is hidden, and goes through clicks there."""
     found = line.copy()
     arc = lengths(line)
     clicked = np.array([int(np.argmin(np.linalg.norm(line - click, axis=1))) for click in clicks])
     drawn = sure.copy()
     for first, last in gaps(sure):
-        drawn[first:last] = arc[last - 1] - arc[first] <= HIDDEN * width or first == 0 or last == len(line)
+        # What has the DLO's colours is not hidden, however its edges look; but beside another strand the line
+        # may have strayed onto that.
+        drawn[first:last] = (arc[last - 1] - arc[first] <= HIDDEN * width or first == 0 or last == len(line)
+                             or np.median(inside[first:last]) > SEEN
+                             and not _beside_itself(line, arc, slice(first, last), width))
     for first, last in gaps(drawn):
         # The edges of what hides the DLO disturb the line next to them.
         low = int(np.searchsorted(arc, arc[first] - 0.7 * width))
