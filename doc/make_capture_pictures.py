@@ -101,8 +101,6 @@ def tell(tab: Tab, server: Page, folder: Path) -> None:
     tab.find('.line.simulated').first.wait_for()
     show(tab, 2, 'Goal')
     picture('capture_result')
-    tab.field('Film of the simulated DLO').last.fill('2.0')
-    time.sleep(DRAWN)
     kept(folder, 'capture', tab.find('#pictures').screenshot())
 
 

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_calibration.capture.middle import Middle
-from dlo_calibration.capture.strip import lengths, odds, straighten, Strip
+from dlo_calibration.capture.strip import evenly, lengths, odds, straighten, Strip
 from dlo_calibration.model.chain import Floats
 
 SURE = 0.35  # quality below which the line is not sure
@@ -25,6 +25,7 @@ BRIDGED = 1.6  # widths: a shorter gap between sure parts is sure, too
 HIDDEN = 1.2  # widths: over a longer gap the line is drawn anew
 CAP = 1.6  # half widths at the end that say nothing about the middle
 EDGE = 0.35  # half widths around an end, in which its edge is
+END_STEP = 0.2  # half widths between places where an end is looked for
 BEFORE = 4.5  # half widths before these, whose curvature goes on
 
 
@@ -54,11 +55,13 @@ def between_ends(pixels: NDArray[np.uint8], middle: Middle, clicks: Floats, near
         way = line[::order]
         arc = lengths(way)
         click = _passed(way, arc, clicks[::order][0])
-        way = way[:int(np.searchsorted(arc, click + near)) + 2]
+        whole = float(arc[-1])
+        way = evenly(way[:int(np.searchsorted(arc, click + near)) + 2], END_STEP * half)
+        arc = lengths(way)
         part = straighten(pixels, way, np.full(len(way), half), np.linspace(-0.25, 0.25, 9))
         found = _end(arc, odds(middle.table, part.lab).mean(axis=1), click, near)
         found = click if found is None else _edge(arc, part, found, EDGE * half)
-        ends.append(float(found if order == 1 else arc[-1] - found))
+        ends.append(float(found if order == 1 else whole - found))
     arc = lengths(line)
     if ends[1] - ends[0] < 2 * spacing:
         return np.empty((0, 2)), np.empty(0, dtype=bool), np.empty(0)
