@@ -31,7 +31,8 @@ from dlo_calibration.capture.strip import (
 )
 from dlo_calibration.model.chain import Floats
 
-SPACING = 4.0  # px between stations
+SPACING = 4.0  # px between stations, at least
+STATIONS = 800  # along a line, at most: more take time, and tell nothing new
 HALVES = 0.5 * np.geomspace(0.3, 2.6, 26)  # of the rough width: half widths that are tried
 FAR = 2.6  # half widths: how far the strip reaches beside the line
 STEP = 0.04  # half widths between the offsets
@@ -77,11 +78,12 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, bey
     :param known: the width is exact to a tenth.
     :param beyond: by how much the line is prolonged at both ends, at least [px].
     """
-    spacing = max(SPACING, width / 10)
+    least = max(SPACING, float(lengths(rough)[-1]) / STATIONS)
+    spacing = max(least, width / 10)
     line = smoothed(evenly(rough, spacing), 0.5 * width / spacing)
     line = prolonged(line, max(beyond, 2.2 * width), width)
     line, half = _first(pixels, evenly(line, 2.0 * spacing), width, known)
-    spacing = max(SPACING, half / 6)
+    spacing = max(least, half / 6)
     halves = np.full(len(line), half)
     for turn in range(TURNS):
         line, halves = _again(line, halves, spacing)
@@ -90,7 +92,7 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, bey
         strength = edges(strip, along * (0.6 if turn == 0 else 1.0))
         table = learn_colours(strip, 0.75, (1.5, 2.4))
         colours = gaussian_filter1d(odds(table, strip.lab), along / 2, axis=0)
-        index, _ = _middles(strip, strength, colours, 1.0)
+        index, _ = _middles(strip, _evidence(strip, strength, colours), 1.0)
         if turn < TURNS - 1:
             halves = halves * _wider(strip, strength, index)
             line = smoothed(strip.at(strip.offsets[index]), along)
@@ -134,26 +136,33 @@ def _first(pixels: NDArray[np.uint8], line: Floats, width: float, known: bool) -
     table = learn_colours(strip, 0.2, (1.2, reach))
     colours = gaussian_filter1d(odds(table, strip.lab), 0.3 * width / spacing, axis=0)
     colours *= np.float32(FIRST_COLOUR / COLOUR)
-    found = [_middles(strip, strength, colours, half) for half in halves]
+    evidence = _evidence(strip, strength, colours)
+    found = [_middles(strip, evidence, half) for half in halves]
     best = int(np.argmax([score for _, score in found]))
     index = found[best][0]
     half = float(halves[best]) * width
     return smoothed(strip.at(strip.offsets[index]), half / spacing), half
 
 
-def _middles(strip: Strip, strength: Singles, colours: Singles,
-             half: float) -> tuple[NDArray[np.int64], float]:
-    """Return the index of the middle's offset at each station, and the mean score."""
-    return steady(_scores(strip, strength, colours, half), DRIFT)
-
-
-def _scores(strip: Strip, strength: Singles, colours: Singles, half: float) -> Singles:
-    """Return how well each offset (n, m) is the middle of a DLO with a half width."""
-    step = strip.offsets[1] - strip.offsets[0]
-    count = len(strip.offsets)
+def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Singles, Singles]:
+    """Return the edges (n, m), of which one counts 1 at most, and the colours (n, m + 1) added up across."""
     # An edge counts fully from a share of the usual one on.
     saturated = np.minimum(strength / max(FULL * _usual(strip, strength), 1e-6), 1)
-    sums = np.concatenate([np.zeros((len(colours), 1), np.float32), np.cumsum(colours, axis=1)], axis=1)
+    return saturated, np.concatenate(
+        [np.zeros((len(colours), 1), np.float32), np.cumsum(colours, axis=1)], axis=1)
+
+
+def _middles(strip: Strip, evidence: tuple[Singles, Singles],
+             half: float) -> tuple[NDArray[np.int64], float]:
+    """Return the index of the middle's offset at each station, and the mean score."""
+    return steady(_scores(strip, evidence, half), DRIFT)
+
+
+def _scores(strip: Strip, evidence: tuple[Singles, Singles], half: float) -> Singles:
+    """Return how well each offset (n, m) is the middle of a DLO with a half width."""
+    saturated, sums = evidence
+    step = strip.offsets[1] - strip.offsets[0]
+    count = len(strip.offsets)
     middle = np.arange(count)
 
     def at(by: float) -> Singles:
