@@ -53,7 +53,7 @@ TRIALS = (Drag(fraction=0.4, direction=(0.1, 1, 0), distance=0.12),
 #: Directions of the photographs: a turn by ASLANT against the rope's straight line, before all actions.
 ASLANT = math.radians(-20)
 BOARD = LaidBoard((0.395, -0.289), ASLANT + math.radians(2))
-STICKER, STICKER_COLOUR = 0.012, (250, 225, 60)  # m, side of a piece of paper that says where the hand opened
+STICKER, STICKER_COLOUR = 0.016, (250, 225, 60)  # m, side of a piece of paper that says where the hand opened
 SIZE, WIDE = (2400, 1800), 26.0  # px; focal length [mm] that would give the same view on film of 36 x 24 mm
 FOCAL = WIDE * math.hypot(*SIZE) / math.hypot(36, 24)  # px
 LENS = (0.02, -0.03, 0.0, 0.0, 0.0)
@@ -115,15 +115,15 @@ def sticker(place: Floats) -> Sheet:
     return Sheet(side, (STICKER, STICKER), (place[0] - STICKER / 2, place[1] - STICKER / 2))
 
 
-def taken(number: int, points: Floats, opened: Floats | None) -> np.ndarray[Any, Any]:
+def taken(number: int, points: Floats, opened: Sequence[Floats]) -> np.ndarray[Any, Any]:
     """
     Return one of the photographs, as pixels.
 
-    :param opened: place where the hand let go (x, y) [m], with a sticker; None: there is none.
+    :param opened: places where the hand let go so far (x, y) [m], each with a sticker.
     """
     along = np.linspace(0.0, 1.0, len(points))
     curve = CubicSpline(along, points)(np.linspace(0.0, 1.0, 601))
-    sheets = (BOARD.sheet, *([] if opened is None else [sticker(opened)]))
+    sheets = (BOARD.sheet, *map(sticker, opened))
     pixels: np.ndarray[Any, Any] = photograph(camera(number), curve, RADIUS,
                                               replace(LOOK, sheets=sheets), seed=13)
     return pixels
@@ -154,11 +154,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = Path(given[0]) if given else HERE.parent / 'msg_samples/photographs'
     folder.mkdir(exist_ok=True)
     lying, actions = shapes()
-    opened = (None, None, actions[1].hands[0].positions[-1])
+    opened = [action.hands[0].positions[-1] for action in actions]
     for number, name in enumerate(NAMES):
         exif = Image.Exif()
         exif.get_ifd(0x8769)[0xa405] = round(WIDE)  # FocalLengthIn35mmFilm
-        Image.fromarray(taken(number, lying[number], opened[number])).save(folder / f'{name}.jpg', quality=85,
+        Image.fromarray(taken(number, lying[number], opened[:number])).save(folder / f'{name}.jpg', quality=85,
                                                                           exif=exif)
     text = json.dumps(truth(lying, actions), indent=1)
     text = re.sub(r'\[\s+([-\d.,\s]+?)\s+\]', lambda found: f'[{" ".join(found[1].split())}]', text)

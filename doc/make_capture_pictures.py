@@ -31,7 +31,7 @@ from capture_page import apart, Page  # noqa: E402
 SAMPLE = HERE.parent / 'msg_samples/photographs'
 CLICKS = json.loads((HERE.parent / 'test/capture/sample_clicks.json').read_text(encoding='utf-8'))
 TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
-STICKER = (1478, 234)  # px, where the yellow sticker is in third.jpg
+STICKERS = ((846, 809), (1478, 234))  # px, where the hand let go in second.jpg and third.jpg
 COLOURS, MOST = 128, 120  # of a picture, and px that count of each; the table's grain takes the most room
 DRAWN = 1.5  # s until everything is drawn
 
@@ -85,12 +85,14 @@ def tell(tab: Tab, server: Page, folder: Path) -> None:
     show(tab, 1, 'Start')
     tab.button('Drag').click()
     typed(tab, 'Gripped point', 40)
+    tab.field('opened at a place that I mark').click()
+    tab.click(STICKERS[0])
     show(tab, 2, 'Start')
     tab.button('Grasp and place').click()
     typed(tab, 'Gripped point', 100)
     typed(tab, 'Height of the lift', 100)
     tab.field('opened at a place that I mark').click()
-    tab.click(STICKER)
+    tab.click(STICKERS[1])
     tab.find('.line.way').first.wait_for()
     picture('capture_hands')
     tab.step('Calibrate')

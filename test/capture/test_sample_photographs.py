@@ -22,10 +22,11 @@ TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
 def interpretation(tmp_path_factory):
     """Return what the capture page makes of the sample, and the ids of the photographs."""
     photographs = {name: ((SAMPLE / name).read_bytes(), clicks) for name, clicks in CLICKS.items()}
-    opened = TRUTH['trials'][1]['hand'][-1][:2]  # at the sticker
-    trials = [{'start': 'first.jpg', 'goal': 'second.jpg', 'steps': [{'kind': 'drag', 'fraction': 0.4}]},
+    opened = [trial['hand'][-1][:2] for trial in TRUTH['trials']]  # at the stickers
+    trials = [{'start': 'first.jpg', 'goal': 'second.jpg', 'steps': [
+                  {'kind': 'drag', 'fraction': 0.4, 'to': opened[0]}]},
               {'start': 'second.jpg', 'goal': 'third.jpg', 'steps': [
-                  {'kind': 'grasp_and_place', 'fraction': 1.0, 'height': 0.1, 'to': opened}]}]
+                  {'kind': 'grasp_and_place', 'fraction': 1.0, 'height': 0.1, 'to': opened[1]}]}]
     return interpreted(tmp_path_factory.mktemp('sample') / 'project', photographs, trials,
                        {'mass': TRUTH['mass_kg']})
 
