@@ -26,7 +26,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'support'))
 
 from photographs import photograph  # noqa: E402
-from scenes import distances, scene  # noqa: E402
+from rendered_scenes import distances, scene  # noqa: E402
 
 from dlo_calibration.capture.trace import Tracer  # noqa: E402
 from dlo_calibration.errors import InputError  # noqa: E402

@@ -42,7 +42,7 @@ import make_photographs as sample  # noqa: E402
 from photographed_trials import interpreted  # noqa: E402
 from photographs import Camera, Look, photograph  # noqa: E402
 from PIL import Image  # noqa: E402
-from scenes import clicks, COLOURS  # noqa: E402
+from rendered_scenes import clicks, COLOURS  # noqa: E402
 from scipy.interpolate import CubicSpline  # noqa: E402
 
 from dlo_calibration import Action, calibrate, Chain, Options, Trial  # noqa: E402

@@ -158,8 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number, name in enumerate(NAMES):
         exif = Image.Exif()
         exif.get_ifd(0x8769)[0xa405] = round(WIDE)  # FocalLengthIn35mmFilm
-        Image.fromarray(taken(number, lying[number], opened[:number])).save(folder / f'{name}.jpg', quality=85,
-                                                                          exif=exif)
+        pixels = taken(number, lying[number], opened[:number])
+        Image.fromarray(pixels).save(folder / f'{name}.jpg', quality=85, exif=exif)
     text = json.dumps(truth(lying, actions), indent=1)
     text = re.sub(r'\[\s+([-\d.,\s]+?)\s+\]', lambda found: f'[{" ".join(found[1].split())}]', text)
     (folder / 'truth.json').write_text(f'{text}\n', encoding='utf-8')

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from photographs import Camera, Hand, Look, photograph
 import pytest
-from scenes import distances, scene
+from rendered_scenes import distances, scene
 
 from dlo_calibration.capture.trace import Tracer
 from dlo_calibration.errors import InputError

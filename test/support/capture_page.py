@@ -143,18 +143,18 @@ class ToyInformation:
     """An appraiser that knows at once what each trial adds, and remembers what it was asked."""
 
     def __init__(self, make_simulator=None):
-        self.started, self.stopped, self.alive, self.waiting = [], 0, False, []
+        self.started, self.stopped, self.alive, self.waiting, self._done = [], 0, False, [], []
 
     def start(self, trials, options):
-        done = self.started[-1] if self.started else []
-        self.started.append([trial.name for trial in trials])
+        done, self._done = self._done, [trial.name for trial in trials]
+        self.started.append(self._done)
         names = options.space.free
         self.waiting += [TrialInformation(name, names, np.full(len(names), 0.3), np.full(len(names), 0.06))
                          for name in self.started[-1] if name not in done]
 
     def stop(self):
         self.stopped += 1
-        self.waiting = []
+        self.waiting, self._done = [], []  # as what was known of the trials is deleted, too
 
     def join(self, timeout=None):
         return not self.alive

@@ -69,6 +69,7 @@ export function crossingDrawn(trace, crossing, k, pointed, asked) {
     h(
       'g.mark.crossing',
       {
+        key: 'mark',
         'data-mark': `crossing ${k}`,
         'data-u': u,
         'data-v': v,

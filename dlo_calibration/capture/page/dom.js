@@ -53,7 +53,7 @@ export function patch(parent, children) {
     let node = child?.key === undefined ? at : keyed.get(child.key);
     if (!node || !agrees(node, child)) node = created(child, parent);
     if (node === at) at = at.nextSibling;
-    else parent.insertBefore(node, at);
+    else placed(parent, node, at);
     update(node, child);
   }
   while (at) {
@@ -61,6 +61,13 @@ export function patch(parent, children) {
     at.remove();
     at = next;
   }
+}
+
+/** Put an element before another one; where it or something in it has the focus, that stays. */
+function placed(parent, node, at) {
+  const focused = node.contains(document.activeElement) ? document.activeElement : null;
+  parent.insertBefore(node, at);
+  focused?.focus({preventScroll: true});
 }
 
 const empty = (child) => child === null || child === undefined || child === false;
