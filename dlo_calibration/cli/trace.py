@@ -133,7 +133,7 @@ def _write(chosen: argparse.Namespace, photograph: Photograph, trace: Trace, cha
 
         write_chain(chosen.output, chain)
     if chosen.picture is not None:
-        from dlo_calibration.capture.picture import write_picture
+        from dlo_calibration.capture.line_picture import write_picture
 
         write_picture(chosen.picture, photograph.pixels, trace, shown)
 

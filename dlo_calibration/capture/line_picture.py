@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Picture: the traced line, drawn over its photograph."""
+"""Line picture: the traced line, drawn over its photograph."""
 
 from __future__ import annotations
 
