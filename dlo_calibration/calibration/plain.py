@@ -34,7 +34,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'default_error_m': found and found.default_error,
         'noise_m': found and found.noise,
         'residual_std_m': found and found.uncertainty.residual,
-        'correlations': _correlations(result), 'undetermined': result.undetermined,
+        'correlations': result.correlations, 'undetermined': result.undetermined,
         'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
             'std', 'expected_std', 'lower', 'upper')}},
         'explanations': {one.name: one.share for one in result.missing_parameters},
@@ -75,12 +75,3 @@ def _without_name(estimate: Any) -> dict[str, Any]:
 def _fit(score: float, scores: Sequence[float], errors: PointErrors) -> dict[str, Any]:
     return {'score': score, 'scores': scores, 'mean_error_m': errors.mean, 'rms_error_m': errors.rms,
             'max_error_m': errors.max, 'mean_abs_error_m': errors.mean_abs}
-
-
-def _correlations(result: CalibrationResult) -> dict[str, dict[str, float]] | None:
-    """Return the correlation of each pair of parameters; None if it is unknown."""
-    found, names = result.examination, result.space.free
-    if found is None or not found.regular or found.uncertainty.correlations is None:
-        return None
-    return {one: dict(zip(names, map(float, row), strict=True))
-            for one, row in zip(names, found.uncertainty.correlations, strict=True)}

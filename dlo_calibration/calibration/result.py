@@ -104,6 +104,15 @@ class CalibrationResult:
         return {name: estimate.value for name, estimate in self.parameters.items()}
 
     @property
+    def correlations(self) -> dict[str, dict[str, float]] | None:
+        """Correlation of each pair of found parameters, by name; None if it is unknown."""
+        found, names = self.examination, self.space.free
+        if found is None or not found.regular or found.uncertainty.correlations is None:
+            return None
+        return {one: dict(zip(names, map(float, row), strict=True))
+                for one, row in zip(names, found.uncertainty.correlations, strict=True)}
+
+    @property
     def std(self) -> Floats:
         """(d,) standard deviations of the found values, in the unit cube."""
         return np.array([estimate.std for estimate in self.parameters.values()]) / SCALE

@@ -15,6 +15,8 @@ from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
 
+MOST_KNOWN = 1000  # trials whose nodes are kept; a plan simulates each of its trials only once
+
 
 class Engine:
     """
@@ -64,6 +66,8 @@ class Engine:
     def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None]:
         """Return the nodes of a trial and the height [m] of nodes on the table; None: unknown or no table."""
         if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
+            while len(self._known) >= MOST_KNOWN:
+                self._known.pop(next(iter(self._known)))
             level = None if self._table_height is None else resting_level(trial, self._table_height)
             self._known[id(trial)] = trial, NodeLayout.of(trial, self._nodes), level
         return self._known[id(trial)][1:]

@@ -1,0 +1,14 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What will happen, and how to get there: predictions of actions, and plans from one configuration to another.
+
+`prediction` simulates given actions with a calibrated DLO; `planner` finds actions that bring it to a goal.
+"""
+
+from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
+from dlo_calibration.planning.plan import Plan, PlannedAction
+from dlo_calibration.planning.rehearsal import Job, Rehearsal, Rehearser, Step
+
+__all__ = ['CalibratedDlo', 'Job', 'Plan', 'PlannedAction', 'Posterior', 'Rehearsal', 'Rehearser', 'Step']

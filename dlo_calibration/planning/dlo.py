@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The calibrated DLO that predictions and plans are made for, and the draws from its posterior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Mapping, Protocol
+
+import numpy as np
+
+from dlo_calibration.calibration.result import ParameterEstimate
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.score import PointErrors
+
+Z90 = 1.6449  # standard deviations from the middle of a normal distribution to an end of its 90 % interval
+
+
+class CalibratedDlo(Protocol):
+    """What a prediction needs of a `CalibrationResult`, or of the `Description` in a result file."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """The found parameters, and the values of the others."""
+
+    @property
+    def parameters(self) -> Mapping[str, ParameterEstimate]:
+        """The found parameters by name, in the order of `space.free`."""
+
+    @property
+    def length(self) -> float:
+        """Mean length of the DLO over the trials [m]."""
+
+    @property
+    def errors(self) -> PointErrors:
+        """Point errors of the fit."""
+
+    @property
+    def correlations(self) -> Mapping[str, Mapping[str, float]] | None:
+        """Correlation of each pair of found parameters; None if it is unknown."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    The distribution of the parameters of a calibrated DLO.
+
+    Each parameter is normal to either side of its value, so that 90 % of its draws lie in the interval of
+    the result; draws beyond the scale are moved to its end.
+
+    :param space: the found parameters, and the values of the others.
+    :param length: of the DLO [m].
+    :param values: (d,) found values on the 0..100 scale, in the order of `space.free`.
+    :param below: (d,) standard deviation below them; `above` (d,) above them.
+    :param correlations: (d, d).
+    """
+
+    space: ParameterSpace
+    length: float
+    values: Floats
+    below: Floats
+    above: Floats
+    correlations: Floats
+
+    @classmethod
+    def of(cls, found: CalibratedDlo) -> Posterior:
+        """Return the posterior of a calibrated DLO."""
+        estimates = [found.parameters[name] for name in found.space.free]
+        values = np.array([one.value for one in estimates])
+        known = found.correlations
+        correlations = np.eye(len(values)) if known is None else np.array(
+            [[known[one][other] for other in found.space.free] for one in found.space.free])
+        return cls(found.space, found.length, frozen_array(values),
+                   frozen_array(np.maximum(values - [one.lower for one in estimates], 0) / Z90),
+                   frozen_array(np.maximum([one.upper for one in estimates] - values, 0) / Z90),
+                   frozen_array(np.where(np.isfinite(correlations), correlations, np.eye(len(values)))))
+
+    @property
+    def best(self) -> dict[str, float]:
+        """Physical values of all parameters at the found values, in SI units."""
+        return self._physical(self.values)
+
+    def draws(self, count: int, seed: int) -> list[dict[str, float]]:
+        """Return physical values of all parameters, in SI units, at `count` draws; the same for a seed."""
+        variances, axes = np.linalg.eigh(self.correlations)
+        normal = np.random.default_rng(seed).standard_normal((count, len(self.values)))
+        normal = normal * np.sqrt(np.maximum(variances, 0)) @ axes.T
+        drawn = self.values + normal * np.where(normal < 0, self.below, self.above)
+        return [self._physical(one) for one in np.clip(drawn, 0.0, SCALE)]
+
+    def _physical(self, values: Floats) -> dict[str, float]:
+        named = dict(zip(self.space.free, map(float, values), strict=True))
+        return self.space.physical(named, self.length)

@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plan: the actions that bring a DLO from one configuration to another, and how near they get."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dlo_calibration.model.action import Action
+from dlo_calibration.model.chain import Chain, Floats
+
+
+@dataclass(frozen=True)
+class PlannedAction:
+    """
+    One action of a plan, and the DLO at rest after it.
+
+    :param name: `grasp_and_place` or `drag`.
+    :param action: the paths of the hands; they close at time 0 and open where they arrive.
+    :param predicted: (n, 3) [m] with the found parameters.
+    :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
+    """
+
+    name: str
+    action: Action
+    predicted: Floats
+    lower: Floats
+    upper: Floats
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    Actions that bring a DLO from a start towards a goal.
+
+    Errors are mean distances of the points from those of the goal, averaged over draws from the posterior.
+
+    :param goal: its point i is the same material point as point i of the start.
+    :param error_before: of the start [m].
+    :param error_after: of the DLO at rest after all actions [m].
+    :param score_after: the paper's difference score after all actions [cm].
+    :param reached: whether `error_after` is within the tolerance.
+    :param tolerance: [m].
+    :param rollouts: number of simulated actions.
+    :param seconds: that the plan took.
+    :param seed: of the search and the draws.
+    :param stop_reason: why the search ended, in words.
+    :param remarks: sentences for the user: why the goal cannot be reached, what the limits prevented.
+    """
+
+    start: Chain
+    goal: Chain
+    actions: tuple[PlannedAction, ...]
+    error_before: float
+    error_after: float
+    score_after: float
+    reached: bool
+    tolerance: float
+    rollouts: int
+    seconds: float
+    seed: int
+    stop_reason: str
+    remarks: tuple[str, ...] = ()

@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""simulate(): what happens to a calibrated DLO in a sequence of actions, and how sure that is."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Callable, Sequence, Union
+
+import numpy as np
+
+from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.model.action import Action
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.named_actions import NamedAction
+from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
+from dlo_calibration.planning.rehearsal import in_turn, Job, PAUSE, Rehearsal, Rehearser, Step
+
+DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
+INTERVAL = (5.0, 95.0)  # %
+
+
+@dataclass(frozen=True)
+class PredictedStep:
+    """
+    An action, and the DLO at rest after it.
+
+    :param name: of the action: that of a named action, else `hand_paths`.
+    :param step: the paths of the hands, in the time of the whole sequence.
+    :param chain: (n, 3) [m] with the found parameters.
+    :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
+    :param settled: False if the DLO did not come to rest within the time limit.
+    """
+
+    name: str
+    step: Step
+    chain: Floats
+    lower: Floats
+    upper: Floats
+    settled: bool
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    What happens to a DLO in a sequence of actions.
+
+    :param draws: number of draws from the posterior that were simulated, besides the found parameters.
+    :param remarks: sentences for the user, such as a draw that could not be simulated.
+    """
+
+    start: Chain
+    steps: tuple[PredictedStep, ...]
+    draws: int
+    remarks: tuple[str, ...] = ()
+
+
+def simulate(found: CalibratedDlo, chain: Chain,
+             actions: Sequence[Union[NamedAction, Action, Step]], *, options: Options | None = None,
+             draws: int = DRAWS, seed: int = 1, make_simulator: SimulatorFactory = make_chosen_simulator,
+             should_stop: Callable[[], bool] = lambda: False) -> Prediction:
+    """
+    Predict the chains at rest after each action.
+
+    A named action begins where the DLO is predicted to be with the found parameters; the hands
+    then take the same paths for every draw.  Actions follow one another when the DLO is at rest.
+
+    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param chain: the DLO before the first action.
+    :param actions: at least one; an `Action` opens its hands at the end, a `Step` says which stay closed.
+    :param options: of the simulation; None: the defaults.
+    :param draws: from the posterior, for the intervals; 0: the intervals contain the model error only.
+    :raises InputError: if an action is impossible with the chain before it.
+    :raises SimulationError: if the simulation with the found parameters diverges.
+    :raises CancelledError: once `should_stop` is True.
+    """
+    if not actions:
+        raise InputError('simulate', 'no action', 'at least one', 'say what the hands do')
+    posterior = Posterior.of(found)
+    with closing(make_simulator(options or Options())) as simulator:
+        rehearse = Rehearser(simulator, should_stop=should_stop)
+        steps, best = _steps(rehearse, chain, actions, posterior.best)
+        drawn = rehearse([Job(chain, steps, physical) for physical in posterior.draws(draws, seed)])
+    failures = [one.failure for one in drawn if one.failure]
+    remarks = () if not failures else (
+        f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
+    lower, upper = intervals(best.chains, [one.chains for one in drawn if not one.failure],
+                             found.errors.rms / np.sqrt(3))
+    return Prediction(
+        chain, tuple(PredictedStep(_name(action), step, frozen_array(best.chains[k]), frozen_array(lower[k]),
+                                   frozen_array(upper[k]), best.settled[k])
+                     for k, (action, step) in enumerate(zip(actions, steps, strict=True))), draws, remarks)
+
+
+def intervals(best: Floats, drawn: Sequence[Floats], error: float) -> tuple[Floats, Floats]:
+    """
+    Return the lower and upper ends of the 90 % intervals of predicted coordinates, both like `best`.
+
+    They contain the spread of the draws, and the error that the calibration left: noise, and what the
+    model cannot represent.  The two are independent, so their half widths add as squares.
+
+    :param best: (..., 3) [m] with the found parameters.
+    :param drawn: the same with draws from the posterior.
+    :param error: standard deviation of one coordinate that the calibration left [m].
+    """
+    everything = np.stack([best, *drawn])
+    below, above = best - np.percentile(everything, INTERVAL, axis=0)
+    left = (Z90 * error)**2
+    return (best - np.sqrt(np.maximum(below, 0)**2 + left), best + np.sqrt(np.minimum(above, 0)**2 + left))
+
+
+def _steps(rehearse: Rehearser, chain: Chain, actions: Sequence[Union[NamedAction, Action, Step]],
+           physical: dict[str, float]) -> tuple[tuple[Step, ...], Rehearsal]:
+    """Return the actions as steps in turn, and their rehearsal with the found parameters."""
+    steps: list[Step] = []
+    for action in actions:
+        if isinstance(action, NamedAction):
+            before, earlier = chain, [step.action for step in in_turn(steps)]
+            if steps:
+                before = Chain(_rehearsed(rehearse, chain, steps, physical).chains[-1])
+                action = replace(action, start=earlier[-1].end + PAUSE)
+            paths = action.action(before, earlier)
+            after = {hand for step in steps[-1:] for hand in step.held_by} - set(action.hand_names)
+            steps.append(Step(paths, (*sorted(after), *(action.hand_names if action.hold else ()))))
+        else:
+            steps.append(action if isinstance(action, Step) else Step(action))
+    return in_turn(steps), _rehearsed(rehearse, chain, steps, physical)
+
+
+def _rehearsed(rehearse: Rehearser, chain: Chain, steps: Sequence[Step],
+               physical: dict[str, float]) -> Rehearsal:
+    found, = rehearse([Job(chain, tuple(steps), physical)])
+    if found.failure:
+        raise SimulationError(found.failure)
+    return found
+
+
+def _name(action: Union[NamedAction, Action, Step]) -> str:
+    return action.name if isinstance(action, NamedAction) else 'hand_paths'

@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rehearsal: a sequence of actions, simulated one after the other from a start."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, Executor, Future
+import copy
+from dataclasses import dataclass, replace
+from itertools import pairwise
+import pickle
+import threading
+from typing import Callable, Mapping, Sequence
+import uuid
+
+import numpy as np
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.action import Action
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.protocol import advanced, Simulator
+
+PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
+REST = 0.01  # s from the end of an action to the instant from which on the DLO comes to rest
+COURSE_STEP = 0.1  # s between two chains of the course of an action
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    An action of a sequence.
+
+    :param held_by: names of the hands that hold the DLO after it; the others open where they arrive.
+    """
+
+    action: Action
+    held_by: tuple[str, ...] = ()
+
+    def starting(self, time: float) -> Step:
+        """Return the same step with an action that starts at a time [s]."""
+        shift = time - self.action.start
+        return replace(self, action=Action(tuple(
+            replace(hand, times=hand.times + shift) for hand in self.action.hands)))
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """
+    What happens in a sequence of actions.
+
+    :param chains: (k, n, 3) [m] the DLO at rest after each of the k actions.
+    :param settled: (k,) False where it did not come to rest within the time limit.
+    :param courses: for each action, (m, n, 3) [m] the DLO while the hands move, every COURSE_STEP; empty
+        where they were not asked for.
+    :param failure: why it could not be simulated, in words; empty if it could.  `chains` is nan then.
+    """
+
+    chains: Floats
+    settled: tuple[bool, ...]
+    courses: tuple[Floats, ...] = ()
+    failure: str = ''
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    A sequence of actions to rehearse.
+
+    :param physical: parameters by name (SI units).
+    :param courses: whether the course of each action is wanted, too.
+    """
+
+    start: Chain
+    steps: tuple[Step, ...]
+    physical: Mapping[str, float]
+    courses: bool = False
+
+
+def in_turn(steps: Sequence[Step], start: float = 0.0) -> tuple[Step, ...]:
+    """Return steps whose actions follow one another, each PAUSE after the end of the one before."""
+    found: list[Step] = []
+    for step in steps:
+        found.append(step.starting(found[-1].action.end + PAUSE if found else start))
+    return tuple(found)
+
+
+def rehearsed_trial(start: Chain, steps: Sequence[Step], courses: bool = False) -> Trial:
+    """Return a trial with the actions in turn; its goals are the DLO at rest after each."""
+    steps, goals = in_turn(steps), []
+    for step in steps:
+        action = step.action
+        if courses:
+            times = np.arange(action.start, action.end, COURSE_STEP)[1:]
+            names = tuple(hand.name for hand in action.hands)
+            goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
+        goals.append(Goal(start, action.end + REST, held_by=step.held_by))
+    return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals))
+
+
+def rehearse(simulator: Simulator, job: Job) -> Rehearsal:
+    """Simulate a sequence of actions; a simulation that diverges gives a rehearsal with a failure."""
+    trial = rehearsed_trial(job.start, job.steps, job.courses)
+    try:
+        rollout = simulator.simulate(trial, job.physical)
+    except SimulationError as error:
+        return Rehearsal(np.full((len(job.steps), len(job.start), 3), np.nan), (False,) * len(job.steps),
+                         failure=str(error))
+    finally:
+        advanced()
+    rests = [k for k, goal in enumerate(trial.goals) if goal.stable]
+    courses = [rollout.chains[before + 1:rest] for before, rest in pairwise([-1, *rests])]
+    return Rehearsal(rollout.chains[rests], tuple(rollout.settled[k] for k in rests),
+                     tuple(courses) if job.courses else ())
+
+
+class Rehearser:
+    """
+    Rehearses many jobs, in this thread or by an executor; the results do not depend on that.
+
+    :param simulator: belongs to this thread; workers use copies of it.
+    :param executor: None: this thread simulates.
+    :param should_stop: asked often.
+    """
+
+    def __init__(self, simulator: Simulator, executor: Executor | None = None,
+                 should_stop: Callable[[], bool] = lambda: False) -> None:
+        self.count = 0  # simulated actions so far
+        self._simulator = simulator
+        self._executor = executor
+        self._should_stop = should_stop
+        self._key = uuid.uuid4().hex  # identifies this simulator in the workers
+        self._packed = b'' if executor is None else pickle.dumps(simulator, pickle.HIGHEST_PROTOCOL)
+
+    def __call__(self, jobs: Sequence[Job]) -> list[Rehearsal]:
+        """
+        Return the rehearsals of jobs, in their order.
+
+        :raises CancelledError: once `should_stop` is True.
+        """
+        if self._executor is None:
+            found = []
+            for job in jobs:
+                self._check()
+                found.append(rehearse(self._simulator, job))
+        else:
+            futures = [self._executor.submit(_rehearse_in_worker, self._key, self._packed, job)
+                       for job in jobs]
+            try:
+                found = [self._awaited(future) for future in futures]
+            finally:
+                for future in futures:
+                    future.cancel()
+        self.count += sum(len(job.steps) for job in jobs)
+        return found
+
+    def _check(self) -> None:
+        if self._should_stop():
+            raise CancelledError
+
+    def _awaited(self, future: Future[Rehearsal]) -> Rehearsal:
+        while True:
+            self._check()
+            try:
+                return future.result(timeout=0.05)
+            except TimeoutError:
+                if future.done():
+                    raise
+
+
+class _WorkerThread(threading.local):
+    """The simulator that a worker's thread keeps."""
+
+    key = ''
+    simulator: Simulator
+
+
+_worker_thread = _WorkerThread()
+
+
+def _rehearse_in_worker(key: str, packed: bytes, job: Job) -> Rehearsal:
+    """Rehearse a job in a worker, which keeps the simulator of a plan."""
+    if _worker_thread.key != key:
+        if _worker_thread.key:
+            _worker_thread.simulator.close()
+        _worker_thread.simulator = copy.copy(pickle.loads(packed))  # noqa: S301  # sent by the parent process
+        _worker_thread.key = key
+    return rehearse(_worker_thread.simulator, job)
+
+
