@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""simulate() predicts the chain after each action, and how sure it is."""
+
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+
+from calibrated import HOSE, MadeUpDlo, ROPE, straight
+import numpy as np
+import pytest
+from toy_simulator import ToySimulator
+
+from dlo_calibration import InputError, Options
+from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
+from dlo_calibration.planning import Job, Posterior, Rehearser, Step
+from dlo_calibration.planning.prediction import intervals, simulate
+
+
+def test_each_named_action_begins_where_the_one_before_left_the_dlo():
+    prediction = simulate(MadeUpDlo(), straight(), [
+        GraspAndPlace(point=0, to=(0.1, 0.2, 0.004)), Drag(point=10, to=(0.3, -0.1, 0.004))], draws=0)
+    first, second = prediction.steps
+    assert (first.name, second.name) == ('grasp_and_place', 'drag')
+    np.testing.assert_allclose(first.chain[0, :2], (0.1, 0.2), atol=0.01)  # the end springs back a little
+    np.testing.assert_allclose(second.step.action.hands[0].positions[0], first.chain[10], atol=1e-12)
+    np.testing.assert_allclose(second.chain[10, :2], (0.3, -0.1), atol=0.01)
+    assert second.step.action.start > first.step.action.end
+    assert first.settled and second.settled
+
+
+def test_a_hand_holds_on_until_it_is_released():
+    prediction = simulate(MadeUpDlo(HOSE), straight(), [
+        LiftAndHold(point=20, height=0.1), Drag(point=0, to=(0.0, 0.1, 0.004), hand='right_hand'),
+        Release()], draws=0)
+    held, still_held, released = (step.chain[20, 2] for step in prediction.steps)
+    assert held == pytest.approx(0.104, abs=1e-3) == still_held
+    assert released < 0.02
+    assert [step.step.held_by for step in prediction.steps] == [('left_hand',), ('left_hand',), ()]
+
+
+def test_paths_and_steps_are_taken_as_they_are():
+    lift = LiftAndHold(point=20, height=0.1).action(straight())
+    opened, = simulate(MadeUpDlo(), straight(), [lift], draws=0).steps
+    held, = simulate(MadeUpDlo(), straight(), [Step(lift, ('left_hand',))], draws=0).steps
+    assert opened.name == held.name == 'hand_paths'
+    assert opened.chain[20, 2] < 0.02 < 0.09 < held.chain[20, 2]
+
+
+def test_what_is_uncertain_makes_the_interval_wide():
+    unsure = {**ROPE, 'friction': (70.0, 40.0, 100.0)}
+    action = GraspAndPlace(point=10, to=(0.3, 0.25, 0.004))
+
+    def width(dlo):
+        step, = simulate(dlo, straight(), [action]).steps
+        assert (step.lower <= step.chain).all() and (step.chain <= step.upper).all()
+        return float((step.upper - step.lower)[:, :2].mean())
+
+    certain, uncertain, noisy = map(width, (MadeUpDlo(), MadeUpDlo(unsure), MadeUpDlo(error=0.01)))
+    assert uncertain > 3 * certain
+    # 90 % of a normal error of 1 cm over three coordinates
+    assert noisy == pytest.approx(2 * 1.645 * 0.01 / 3**0.5, rel=0.05)
+
+
+def test_intervals_hold_90_percent_of_normal_errors():
+    generator = np.random.default_rng(1)
+    best = np.zeros((50, 21, 3))
+    drawn = [np.broadcast_to(generator.normal(0, 2e-3, (50, 1, 1)), best.shape) for _ in range(100)]
+    lower, upper = intervals(best, drawn, 1e-3)
+    seen = generator.normal(0, 2e-3, (50, 1, 1)) + generator.normal(0, 1e-3, best.shape)
+    assert np.mean((lower < seen) & (seen < upper)) == pytest.approx(0.9, abs=0.05)
+
+
+def test_the_same_seed_gives_the_same_prediction():
+    action = GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1)
+    one, same, other = (simulate(MadeUpDlo(), straight(), [action], draws=3, seed=seed).steps[0]
+                        for seed in (1, 1, 2))
+    assert np.array_equal(one.lower, same.lower) and np.array_equal(one.chain, other.chain)
+    assert not np.array_equal(one.lower, other.lower)
+
+
+def test_rehearsals_do_not_depend_on_the_executor():
+    simulator = make_simulator(Options())
+    step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    jobs = [Job(straight(), (step, step), physical, courses=True)
+            for physical in Posterior.of(MadeUpDlo()).draws(4, 1)]
+    alone = Rehearser(simulator)
+    with ThreadPoolExecutor(2) as executor:
+        together = Rehearser(simulator, executor)
+        for one, other in zip(alone(jobs), together(jobs), strict=True):
+            assert np.array_equal(one.chains, other.chains)
+            assert all(map(np.array_equal, one.courses, other.courses))
+            assert len(one.courses) == 2 and len(one.courses[0]) > 10
+    assert alone.count == together.count == 8
+
+
+def test_a_rehearsal_that_diverges_says_so():
+    step = Step(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    physical = Posterior.of(MadeUpDlo()).best
+    found, = Rehearser(ToySimulator(fail_below=101))([Job(straight(), (step,), physical)])
+    assert 'diverged' in found.failure
+    assert np.isnan(found.chains).all()
+
+
+def test_it_can_be_stopped():
+    with pytest.raises(CancelledError):
+        simulate(MadeUpDlo(), straight(), [Drag(point=0, to=(0.1, 0.1, 0.004))], should_stop=lambda: True)
+
+
+@pytest.mark.parametrize(('actions', 'what'), [
+    ([], 'no action'),
+    ([Drag(point=30, to=(0.1, 0.1, 0.004))], 'point 30'),
+    ([Release()], 'holds nothing'),
+])
+def test_impossible_actions_are_refused(actions, what):
+    with pytest.raises(InputError, match=what):
+        simulate(MadeUpDlo(), straight(), actions)
