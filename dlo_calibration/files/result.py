@@ -11,6 +11,7 @@ mass, and the calibration that found them.  The node publishes it, and result.xm
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
+from itertools import combinations
 import math
 from pathlib import Path
 from types import MappingProxyType
@@ -55,6 +56,7 @@ class Description:
     :param mass: of the whole DLO [kg]; 0: unknown.
     :param length: mean length of the DLO over the trials [m].
     :param chain: the DLO at rest, before the first trial's action, with its annotations.
+    :param correlations: of each pair of found parameters, by name, -1 to 1; None: they are unknown.
     :param options: options of the calibration, by name; empty where they were not given.
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
@@ -79,6 +81,7 @@ class Description:
     simulations: int
     seconds: float
     stop_reason: str
+    correlations: Mapping[str, Mapping[str, float]] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
@@ -99,8 +102,8 @@ class Description:
             parameters=result.parameters, mass=space.mass, fixed=fixed,
             length=result.length, chain=result.trials[0].initial, score=result.best.score,
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
-            errors=result.errors, options=options or {}, warnings=result.warnings,
-            confirmation=result.confirmation, **{key: told[key] for key in HOW})
+            errors=result.errors, correlations=result.correlations, options=options or {},
+            warnings=result.warnings, confirmation=result.confirmation, **{key: told[key] for key in HOW})
 
     @property
     def file_options(self) -> FileOptions:
@@ -138,6 +141,10 @@ def description_document(found: CalibrationResult | Description,
     for name, value in dlo.fixed.items():
         physical, unit = space.reported(name, value)
         add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)
+    if dlo.correlations is not None:
+        correlations = add(parameters, 'correlations')
+        for one, other in combinations(dlo.parameters, 2):
+            add(correlations, 'correlation', first=one, second=other, value=dlo.correlations[one][other])
     how = {key: getattr(dlo, key) for key in HOW}
     calibration = add(root, 'calibration', **{key: 'none' if one is None else one
                                               for key, one in how.items()})
@@ -198,7 +205,8 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
             search=calibration.get('search'), engine=calibration.get('engine'),
             seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
             simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
-            stop_reason=calibration.get('stop_reason'), options=given.values,
+            stop_reason=calibration.get('stop_reason'), correlations=_correlations(where, parameters),
+            options=given.values,
             problems=given.problems, refusal=given.refusal,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=_confirmation(where, second[0]) if second else None)
@@ -266,6 +274,28 @@ def _fixed(where: str, parameters: Any) -> dict[str, float]:
         if not 0 <= fixed[name] <= SCALE:
             raise refused(where, element, f'value {fixed[name]:g}', '0 to 100')
     return fixed
+
+
+def _correlations(where: str, parameters: Any) -> dict[str, dict[str, float]] | None:
+    element = parameters.find('correlations')
+    if element is None:
+        return None
+    names = [found.get('name') for found in parameters.findall('found')]
+    found = {name: {name: 1.0} for name in names}
+    for one in element:
+        pair, value = (one.get('first'), one.get('second')), number(where, one, 'value')
+        if pair[0] == pair[1] or not found.keys() >= set(pair):
+            raise refused(where, one, f'the pair {pair[0]!r}, {pair[1]!r}', 'two found parameters')
+        if pair[1] in found[pair[0]]:
+            raise refused(where, one, f'the pair {pair[0]!r}, {pair[1]!r} twice', 'each pair once')
+        if not -1 <= value <= 1:
+            raise refused(where, one, f'value {value:g}', '-1 to 1')
+        found[pair[0]][pair[1]] = found[pair[1]][pair[0]] = value
+    pairs = len(names) * (len(names) - 1) // 2
+    if len(element) != pairs:
+        raise refused(where, element, f'{len(element)} correlations', f'{pairs}, one for each pair',
+                      'add the others, or leave all out')
+    return found
 
 
 def _check_physical(where: str, element: Any, space: ParameterSpace) -> None:

@@ -84,11 +84,13 @@ class Uncertainty:
 
     @property
     def correlations(self) -> Floats | None:
-        """(d, d) correlations of the parameters; None if they are unknown."""
+        """(d, d) correlations of the parameters, symmetric, 1 on the diagonal; None if they are unknown."""
         if self.covariance is None:
             return None
         std = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(std, std))
+        found = (self.covariance + self.covariance.T) / 2 / np.outer(std, std)
+        np.fill_diagonal(found, 1.0)
+        return np.asarray(np.clip(found, -1.0, 1.0))  # rounding may lead beyond
 
     @property
     def undetermined(self) -> tuple[Floats, ...]:

@@ -50,6 +50,13 @@ def file(tmp_path, result):
     return tmp_path / 'result.xml'
 
 
+def refused(path, match):
+    with pytest.raises(InputError, match=match) as caught:
+        read_result(path)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('mass', [0.0, 0.1 + 0.2])
 def test_same_physical_values_bit_for_bit(tmp_path, seed, mass):
@@ -105,6 +112,27 @@ def test_a_document_from_before_there_were_verdicts_stays_as_it_is(file):
     assert description_document(read_result(file)) == older
 
 
+def test_correlations_come_back(file, result):
+    found = read_result(file).correlations
+    assert found == result.correlations
+    assert found['friction']['flexibility'] == found['flexibility']['friction'] != 0
+    assert found['friction']['friction'] == 1
+
+
+def test_a_document_from_before_there_were_correlations_stays_as_it_is(file):
+    older = re.sub(rb' *<correlations>.*</correlations>\n', b'', file.read_bytes(), flags=re.DOTALL)
+    assert older != file.read_bytes()
+    file.write_bytes(older)
+    assert read_result(file).correlations is None
+    assert description_document(read_result(file)) == older
+
+
+def test_a_missing_pair_is_refused(file):
+    text = re.sub('<correlation .*/>', '', file.read_text(encoding='utf-8'))
+    file.write_text(text, encoding='utf-8')
+    refused(file, '<correlations>.*0 correlations, expected 1, one for each pair')
+
+
 def test_document_is_for_people_too(file):
     lines = file.read_text(encoding='utf-8').splitlines()
     assert lines[0] == "<?xml version='1.0' encoding='UTF-8'?>"
@@ -127,13 +155,6 @@ def test_any_text_and_number_survives(tmp_path_factory, result, text, value, len
     assert found.warnings == (printable,)
 
 
-def refused(path, match):
-    with pytest.raises(InputError, match=match) as caught:
-        read_result(path)
-    assert '\n' not in str(caught.value)
-    return str(caught.value)
-
-
 @pytest.mark.parametrize('change, match', [
     (('version="1"', 'version="2"'), "<dlo>.*version.*'2'.*expected one of '1'"),
     (('<dlo version="1"', '<dlo version="1" more="1"'), "<dlo>.*'more'"),
@@ -152,6 +173,10 @@ def refused(path, match):
     (('seed="1"', 'seed="1.5"'), '<calibration>.*seed'),
     (('mass="', 'mass="-'), 'mass'),
     (('identifiable="', 'identifiable="per'), 'identifiable'),
+    (('<correlation first="friction"', '<correlation first="flexibility"'), '<correlation>.*two found'),
+    (('<correlation first="friction"', '<correlation first="damping"'), "<correlation>.*'damping'"),
+    (('second="flexibility" value="', 'second="flexibility" value="9'), '<correlation>.*-1 to 1'),
+    (('second="flexibility" value="', 'second="flexibility" value="nan'), '<correlation>.*value'),
     (('<options>', '<options>text'), '<options>'),
     (('<warnings/>', '<warnings/><warnings/>'), '<warnings>'),
     (('name="seed" value="1"', 'name="seed" value="{"'), '<option>.*seed.*an integer'),
@@ -173,6 +198,9 @@ def test_unexpected_is_refused_by_line_and_element(file, change, match):
     (('<fixed name="damping"', '<fixed name="weight"'), 'weight'),
     (('<fixed name="damping"', '<fixed name="elasticity"'), '<fixed>.*elasticity.*twice'),
     (('<found name="friction"', '<found name="flexibility"'), '<found>.*flexibility.*twice'),
+    (('<correlations>', '<correlations><correlation first="flexibility" second="friction" value="0"/>'),
+     '<correlation>.*twice'),
+    (('</correlations>', '</correlations><correlations/>'), '<correlations>'),
     (('<warnings/>', ''), '<calibration>.*Missing.*warnings'),
     (('name="seed" value="1"', 'name="evaluations" value="1"'), '<option>.*evaluations.*twice'),
 ])
