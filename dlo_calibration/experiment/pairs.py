@@ -98,7 +98,7 @@ def random_curve(dlo: KnownDlo, generator: np.random.Generator) -> Floats:
 
 
 def clear_of_itself(dlo: KnownDlo, points: Floats) -> bool:
-    """Tell whether no part of a DLO, of which (n, 3) [m] are the points, crosses or nearly touches another."""
+    """Tell whether no part of a DLO with the (n, 3) points [m] crosses another, or nearly touches it."""
     distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
     index = np.arange(len(points))
     along = np.abs(index[:, None] - index[None]) * dlo.length / (len(points) - 1)
