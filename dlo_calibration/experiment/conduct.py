@@ -5,24 +5,22 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, wait
 from contextlib import closing
 from dataclasses import dataclass
+import functools
 import json
 from pathlib import Path
-import time
-from typing import Callable, Iterator, Sequence, TextIO
+from typing import Callable, Sequence, TextIO
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment import tables
 from dlo_calibration.experiment.journal import Journal
 from dlo_calibration.experiment.outcome import judged_chains, Outcome, perform
+from dlo_calibration.experiment.performing import perform_all
 from dlo_calibration.experiment.study import Subject, Task, tasks
 from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.report.drawing import session_picture
-from dlo_calibration.report.terminal import TaskBar
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.writing import Attempts, make_folder, whole
 
@@ -71,11 +69,11 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     :raises InputError: if `folder` cannot be made, or its journal cannot be read.
     """
     make_folder(folder)
-    attempts, journal = Attempts(folder), Journal(folder / JOURNAL)
+    attempts, journal = Attempts(folder), Journal(folder / JOURNAL, Outcome.of)
     engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
     wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
-    _perform_all([task for task in wanted if journal.find(task) is None], len(wanted), plan.workers,
-                 journal, make_simulator, stop, note, stream)
+    perform_all('calibrations', wanted, journal, functools.partial(perform, make_simulator=make_simulator),
+                plan.workers, stop, note, stream)
     if journal.failure:
         attempts.fail(f'the end of {JOURNAL}', journal.failure)
     done = [(task, outcome) for task in wanted if (outcome := journal.find(task)) is not None]
@@ -101,47 +99,6 @@ def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
     with closing(make_simulator(subject.observed.options)) as simulator:
         simulator.prepare()
         return simulator.name
-
-
-def _perform_all(waiting: Sequence[Task], total: int, workers: int, journal: Journal,
-                 make_simulator: SimulatorFactory, stop: Callable[[], bool], note: Callable[[str], None],
-                 stream: TextIO) -> None:
-    """Perform tasks, each in one process, and add each outcome to the journal at once, until that fails."""
-    if not waiting:
-        return
-    if len(waiting) < total:
-        note(f'{total - len(waiting)} of {total} calibrations are done already')
-    begun = told = time.monotonic()
-    with TaskBar('calibrations', total, total - len(waiting), stream) as bar:
-        outcomes = _outcomes(waiting, min(workers or cores(), len(waiting)), make_simulator, stop, note)
-        for count, (task, outcome) in enumerate(outcomes, start=1):
-            journal.add(task, outcome)
-            if journal.failure:
-                return
-            bar.advance()
-            now = time.monotonic()
-            if not bar.shown and now - told > 30.0:  # s, in a log file
-                told = now
-                left = (now - begun) / count * (len(waiting) - count)
-                note(f'{total - len(waiting) + count} of {total} calibrations; {left:.0f} s left')
-
-
-def _outcomes(waiting: Sequence[Task], workers: int, make_simulator: SimulatorFactory,
-              stop: Callable[[], bool], note: Callable[[str], None]) -> Iterator[tuple[Task, Outcome]]:
-    """Yield each task with its outcome when it is done; end early if stopped."""
-    if workers == 1:
-        for task in waiting:
-            try:
-                yield task, perform(task, make_simulator, stop)
-            except CancelledError:
-                return
-        return
-    with closing(ProcessExecutor(workers, note)) as executor:
-        futures: dict[Future[Outcome], Task] = {
-            executor.submit(perform, task, make_simulator): task for task in waiting}
-        while futures and not stop():
-            for future in wait(futures, 0.1, FIRST_COMPLETED).done:  # s, then look at `stop` again
-                yield futures.pop(future), future.result()
 
 
 def _write_all(account: tables.Account, groups: Sequence[Sequence[tuple[Task, Outcome]]],

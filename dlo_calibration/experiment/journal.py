@@ -10,26 +10,41 @@ from errno import EEXIST
 import json
 import os
 from pathlib import Path
+from typing import Any, Callable, Generic, Mapping, Protocol, TypeVar
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.experiment.outcome import Outcome
-from dlo_calibration.experiment.study import Task
+
+Done = TypeVar('Done')
 
 
-class Journal:
+class Recorded(Protocol):
+    """A task whose outcome is kept."""
+
+    @property
+    def key(self) -> str:
+        """A digest of all that the outcome depends on."""
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """Plain values that tell a reader of the journal which task it is."""
+
+
+class Journal(Generic[Done]):
     """
     The outcomes of an experiment, in a file with one JSON document per line.
 
     An incomplete line, which a killed process leaves, is ignored.
 
+    :param of: builds an outcome, a dataclass, from its `asdict`; raises TypeError, KeyError or ValueError
+        for any other values.
     :ivar failure: why an outcome could not be written; empty if all could be.
     :raises InputError: if the file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, of: Callable[[Mapping[str, Any]], Done]) -> None:
         self._path = path
         self.failure = ''
-        self._outcomes: dict[str, Outcome] = {}
+        self._outcomes: dict[str, Done] = {}
         if path.is_symlink() or (path.exists() and not path.is_file()):  # a FIFO would block for ever
             raise self._unusable(OSError(EEXIST, 'something that is no file has this name'))
         try:
@@ -39,21 +54,19 @@ class Journal:
         for line in text.splitlines():
             try:
                 entry = json.loads(line)
-                self._outcomes.setdefault(entry['key'], Outcome.of(entry['outcome']))
+                self._outcomes.setdefault(entry['key'], of(entry['outcome']))
             except (ValueError, TypeError, KeyError):
                 continue
         self._cut = bool(text) and not text.endswith('\n')
 
-    def find(self, task: Task) -> Outcome | None:
+    def find(self, task: Recorded) -> Done | None:
         """Return the outcome of a task; None if it is not done."""
         return self._outcomes.get(task.key)
 
-    def add(self, task: Task, outcome: Outcome) -> None:
+    def add(self, task: Recorded, outcome: Done) -> None:
         """Append an outcome; when this returns, it is on disk, or `failure` says why not."""
-        line = json.dumps({
-            'object': task.subject.name, 'search': task.search, 'seed': task.seed, 'engine': task.engine,
-            'left_out': None if task.left_out is None else task.left_out + 1,
-            'outcome': asdict(outcome), 'key': task.key})
+        plain: Any = outcome
+        line = json.dumps({**task.about, 'outcome': asdict(plain), 'key': task.key})
         try:
             with self._path.open('a', encoding='utf-8') as stream:
                 stream.write(('\n' if self._cut else '') + f'{line}\n')

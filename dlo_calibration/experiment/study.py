@@ -96,13 +96,18 @@ class Task:
             return Observed((self.subject.observed.trials[self.left_out],), self.options)
         return self.subject.others or Observed((), self.options)
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """Plain values that tell a reader of the journal which calibration it is."""
+        return {'object': self.subject.name, 'search': self.search, 'seed': self.seed, 'engine': self.engine,
+                'left_out': None if self.left_out is None else self.left_out + 1}
+
     @functools.cached_property
     def key(self) -> str:
         """A digest of all that the outcome depends on: tasks with the same key have the same outcome."""
         judges = self.judges
-        about = [_sources(), self.engine, self.trials, _effective(self.options), judges.trials,
-                 _effective(judges.options)]
-        return hashlib.sha256(json.dumps(_plain(about), sort_keys=True).encode()).hexdigest()
+        return digest(self.engine, self.trials, effective(self.options), judges.trials,
+                      effective(judges.options))
 
 
 def tasks(subjects: Sequence[Subject], searches: Sequence[str], runs: int, seed: int,
@@ -120,7 +125,12 @@ def tasks(subjects: Sequence[Subject], searches: Sequence[str], runs: int, seed:
                     yield Task(subject, search, seed + run, engines[subject.name], left_out)
 
 
-def _effective(options: Options) -> dict[str, Any]:
+def digest(*about: Any) -> str:
+    """Return a digest of dataclasses, arrays and plain values, and of the source code of the package."""
+    return hashlib.sha256(json.dumps(_plain([_sources(), *about]), sort_keys=True).encode()).hexdigest()
+
+
+def effective(options: Options) -> dict[str, Any]:
     """Return the options that can change what a calibration finds."""
     of_the_machine = names_of(MACHINE)
     return {name: value for name, value in options.flat().items() if name not in of_the_machine}

@@ -152,27 +152,27 @@ OUTCOME = Outcome({'friction': 0.1 + 0.2}, ('friction',), 1.5, 0.01, 40, 120, 0.
 
 
 def test_the_journal_gives_back_every_digit(tmp_path):
-    Journal(tmp_path / 'x').add(task(), OUTCOME)
-    assert Journal(tmp_path / 'x').find(task()) == OUTCOME
-    assert Journal(tmp_path / 'x').find(task(seed=2)) is None
+    Journal(tmp_path / 'x', Outcome.of).add(task(), OUTCOME)
+    assert Journal(tmp_path / 'x', Outcome.of).find(task()) == OUTCOME
+    assert Journal(tmp_path / 'x', Outcome.of).find(task(seed=2)) is None
 
 
 @pytest.mark.parametrize('rest', ['{"key": "a", "outc', '[1]', '{"key": "a"}', '{"key": "a", "outcome": {}}',
                                   '{"key": "a", "outcome": 3}', '\0\0', 'null\n'])
 def test_lines_that_are_none_do_not_count_and_spoil_nothing(tmp_path, rest):
     path = tmp_path / 'x'
-    Journal(path).add(task(), OUTCOME)
+    Journal(path, Outcome.of).add(task(), OUTCOME)
     path.write_text(path.read_text() + rest)
-    journal = Journal(path)
+    journal = Journal(path, Outcome.of)
     assert journal.find(task()) == OUTCOME
     journal.add(task(seed=2), OUTCOME)
     journal.add(task(seed=3), OUTCOME)
-    again = Journal(path)
+    again = Journal(path, Outcome.of)
     assert [again.find(task(seed=seed)) for seed in (1, 2, 3, 4)] == [OUTCOME] * 3 + [None]
 
 
 def test_the_journal_says_what_a_line_is_of(tmp_path):
-    Journal(tmp_path / 'x').add(task(left_out=1, search='cma_es', seed=5), OUTCOME)
+    Journal(tmp_path / 'x', Outcome.of).add(task(left_out=1, search='cma_es', seed=5), OUTCOME)
     entry = json.loads((tmp_path / 'x').read_text())
     assert (entry['object'], entry['search'], entry['seed'], entry['left_out'], entry['engine']) == (
         'rope', 'cma_es', 5, 2, 'toy')
@@ -180,11 +180,11 @@ def test_the_journal_says_what_a_line_is_of(tmp_path):
 
 def test_a_journal_that_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(InputError, match='--output'):
-        Journal(tmp_path)
+        Journal(tmp_path, Outcome.of)
 
 
 def test_a_journal_that_cannot_be_written_says_so_and_still_knows_the_outcome(tmp_path):
-    journal = Journal(tmp_path / 'nowhere' / 'x')
+    journal = Journal(tmp_path / 'nowhere' / 'x', Outcome.of)
     journal.add(task(), OUTCOME)
     assert journal.failure == 'No such file or directory'
     assert journal.find(task()) == OUTCOME
