@@ -16,7 +16,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping
 
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.declaration import MACHINE
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.errors import InputError
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Sequence
 
+from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.engines import engine_settings
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.evaluation.log import digest
 from dlo_calibration.model.trial import Trial
 

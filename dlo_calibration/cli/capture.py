@@ -18,9 +18,10 @@ import threading
 from typing import Any, Callable, Iterator, TYPE_CHECKING
 import webbrowser
 
+from dlo_calibration.calibration.declaration import MACHINE, OBSERVATION
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.file_options import recordable
-from dlo_calibration.calibration.options import MACHINE, names_of, OBSERVATION, Options
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.cli.options import add_options, given_options, PREFIX
 from dlo_calibration.cli.output import standard_output, tell

@@ -11,9 +11,10 @@ import shlex
 import sys
 from typing import Sequence
 
+from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.file_options import FileOptions
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.cli.output import print_json, standard_output, tell
 from dlo_calibration.cli.source import add_common_arguments, read_source

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Callable
 
+from dlo_calibration.calibration.declaration import OBSERVATION
 from dlo_calibration.calibration.file_options import FileOptions
-from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.request import read_request, request_trials

@@ -14,8 +14,9 @@ from typing import Any, Callable, Mapping, Self
 
 import numpy as np
 
+from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.identity import calibration_digest
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import given_options, PREFIX
 from dlo_calibration.cli.source import Source
 from dlo_calibration.errors import InputError, unwritable

@@ -20,7 +20,8 @@ from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.declaration import MACHINE
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.trial import Trial
 

@@ -24,8 +24,9 @@ from typing import Any, Iterator, Mapping
 from lxml import etree
 import numpy as np
 
+from dlo_calibration.calibration.declaration import Declaration
 from dlo_calibration.calibration.file_options import file_options, FileOptions, recordable
-from dlo_calibration.calibration.options import Declaration, declarations, Options
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.intake import require_file
 from dlo_calibration.model.chain import Chain, Floats

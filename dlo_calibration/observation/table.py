@@ -52,25 +52,40 @@ def rest_on(points: Floats, level: float) -> Floats:
     return rested
 
 
+def crossing_segments(points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats]:
+    """
+    Find the pairs of segments of a chain that cross, seen from above.
+
+    The end of a segment belongs to the next one.  Neighbours, and parallel segments, do not cross.
+
+    :param points: (n, 3) [m].
+    :returns: the indices of both segments of each pair, (c,) and (c,), the first one nearer to the first
+        point; and at which share of each of them, 0 to 1, it crosses the other, (c,) and (c,).
+    """
+    begin, step = points[:-1], np.diff(points, axis=0)
+    here, there = np.triu_indices(len(step), 2)
+    u, v, between = step[here], step[there], begin[there] - begin[here]
+    with np.errstate(divide='ignore', invalid='ignore'):  # parallel segments do not cross
+        determinant = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+        s = (between[:, 0] * v[:, 1] - between[:, 1] * v[:, 0]) / determinant
+        t = (between[:, 0] * u[:, 1] - between[:, 1] * u[:, 0]) / determinant
+    found = np.flatnonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1))
+    return here[found], there[found], s[found], t[found]
+
+
 def _stacked(points: Floats, level: float) -> NDArray[np.bool_]:
     """
     Tell which (N, 3) [m] points belong to a part that lies on another part of the DLO, and rises for that.
 
     It does where its segment is above one of the other's, and at least STACKED higher.
     """
-    begin, step = points[:-1], np.diff(points, axis=0)
-    here, there = np.triu_indices(len(step), 2)
-    u, v, between = step[here], step[there], begin[there] - begin[here]
+    rise = np.diff(points[:, 2])
     stacked = np.zeros(len(points), bool)
-    with np.errstate(divide='ignore', invalid='ignore'):  # parallel segments do not cross
-        determinant = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-        s = (between[:, 0] * v[:, 1] - between[:, 1] * v[:, 0]) / determinant
-        t = (between[:, 0] * u[:, 1] - between[:, 1] * u[:, 0]) / determinant
-    for k in np.flatnonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1)):
-        higher = float(between[k, 2] + t[k] * v[k, 2] - s[k] * u[k, 2])
+    for here, there, s, t in zip(*crossing_segments(points), strict=True):
+        higher = float(points[there, 2] + t * rise[there] - points[here, 2] - s * rise[here])
         if abs(higher) >= STACKED:
             raised = points[:, 2] > level + abs(higher) * RISEN
-            upper = int(there[k] if higher > 0 else here[k])
+            upper = int(there if higher > 0 else here)
             first, last = upper + 1, upper
             while first > 0 and raised[first - 1]:
                 first -= 1

@@ -15,7 +15,8 @@ import json
 import sys
 import textwrap
 
-from dlo_calibration.calibration.options import Declaration, declarations
+from dlo_calibration.calibration.declaration import Declaration
+from dlo_calibration.calibration.options import declarations
 
 HEAD = """\
 All parameters of the node calibrator, with their defaults.  To change some, copy this file, edit the copy

@@ -16,7 +16,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dlo_calibration.calibration.options import Declaration, declarations, Options
+from dlo_calibration.calibration.declaration import Declaration
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
 
 #: Beginnings of the names of the parameters that rclpy declares itself.

@@ -12,8 +12,9 @@ from toy_messages import session_messages, toy_trials, write_session
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
+from dlo_calibration.calibration.declaration import MACHINE, OBSERVATION, SEARCH
 from dlo_calibration.calibration.file_options import file_options
-from dlo_calibration.calibration.options import declarations, MACHINE, OBSERVATION, Options, SEARCH
+from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError

@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""PlanOptions: the options of a plan, declared once, here; see `calibration.options`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dlo_calibration.calibration.declaration import declared, DeclaredOptions, MACHINE, SEARCH
+from dlo_calibration.errors import InputError
+from dlo_calibration.planning.regions import REACH, read_box, read_reach
+
+HANDS = ('hand_1', 'hand_2')
+KINDS = ('grasp_and_place', 'drag')  # of actions
+POINTS, SCORE = 'points', 'score'  # objectives
+
+
+@dataclass(frozen=True)
+class PlanOptions(DeclaredOptions):
+    """Everything that a user can set for a plan; the declarations state meaning, unit and range."""
+
+    actions: int = declared(4, 'largest number of actions of a plan; fewer win if the goal is reached with '
+                            'them', minimum=1, maximum=20, of=SEARCH)
+    hands: int = declared(1, 'number of hands, hand_1 and hand_2; two act at the same time', minimum=1,
+                          maximum=len(HANDS), of=SEARCH)
+    kinds: tuple[str, ...] = declared(KINDS, 'the kinds of actions that a plan may have', choices=KINDS,
+                                      of=SEARCH)
+    objective: str = declared(
+        POINTS, "what is minimised: points, the mean distance of the points from the goal; or score, the "
+        "paper's difference score, which counts orientation and facing", choices=(POINTS, SCORE), of=SEARCH)
+    tolerance: float = declared(
+        1.0, 'the goal is reached if the mean distance of the points from it is at most this share of the '
+        'length', unit='%', minimum=0.01, maximum=100.0, of=SEARCH)
+    crossings: bool = declared(False, 'whether an action may put the DLO over itself', of=SEARCH)
+    draws: int = declared(8, 'number of draws from the posterior that a plan is judged on; 0: only on the '
+                          'found parameters', minimum=0, maximum=1000, of=SEARCH)
+    seed: int = declared(1, 'random seed; the same seed gives the same plan', minimum=0, maximum=2**31 - 1,
+                         of=SEARCH)
+    height: float = declared(0.05, 'lift of a grasp_and_place above the higher one of its two places',
+                             unit='m', minimum=0.001, maximum=10.0, of=MACHINE)
+    speed: float = declared(0.1, 'speed of the hands', unit='m/s', minimum=0.001, maximum=10.0, of=MACHINE)
+    reach_1: str = declared(
+        '', f'where hand_1 can be: {REACH}, in the frame of the chains; empty: everywhere', of=MACHINE)
+    reach_2: str = declared('', 'where hand_2 can be, as reach_1', of=MACHINE)
+    no_go: tuple[str, ...] = declared(
+        (), "boxes that neither a hand nor the DLO may enter, each 'x0 y0 z0 x1 y1 z1', two opposite corners "
+        'in metres in the frame of the chains; they should be larger than what they protect by the size of '
+        'the gripper, as a hand counts as a point', of=MACHINE)
+    workers: int = declared(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
+                            of=MACHINE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.kinds or len(set(self.kinds)) < len(self.kinds):
+            raise InputError('parameter kinds', f'{" ".join(self.kinds) or "no name"}',
+                             'one or more different names', 'name each kind of action once')
+        # ROS cannot tell an empty list of texts from other empty lists, so [''] stands for it there.
+        object.__setattr__(self, 'no_go', tuple(text for text in self.no_go if text.strip()))
+        for name in ('reach_1', 'reach_2'):
+            read_reach(f'parameter {name}', getattr(self, name))
+        for text in self.no_go:
+            read_box('parameter no_go', text)
