@@ -55,8 +55,6 @@ class PlanOptions(DeclaredOptions):
         if not self.kinds or len(set(self.kinds)) < len(self.kinds):
             raise InputError('parameter kinds', f'{" ".join(self.kinds) or "no name"}',
                              'one or more different names', 'name each kind of action once')
-        # ROS cannot tell an empty list of texts from other empty lists, so [''] stands for it there.
-        object.__setattr__(self, 'no_go', tuple(text for text in self.no_go if text.strip()))
         for name in ('reach_1', 'reach_2'):
             read_reach(f'parameter {name}', getattr(self, name))
         for text in self.no_go:

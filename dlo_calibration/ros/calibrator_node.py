@@ -30,6 +30,7 @@ from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, InputError, printable
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
@@ -94,7 +95,7 @@ class _Notices(logging.Handler):
         self._tell(record.getMessage())
 
 
-class CalibratorNode(OptionsNode):
+class CalibratorNode(OptionsNode[Options]):
     """
     The node `calibrator`; it is the `Graph` of its session.
 
@@ -104,7 +105,7 @@ class CalibratorNode(OptionsNode):
     """
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
-        super().__init__('calibrator', **arguments)
+        super().__init__('calibrator', Options, **arguments)
         self._notices = _Notices(self.warn)
         LOG.addHandler(self._notices)
         types = rclpy_types()

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameter file: ``config/calibrator.yaml``, every parameter of the node with a comment.
+Parameter file: ``config/calibrator.yaml`` or ``config/planner.yaml``, every parameter with a comment.
 
-The file is generated from the declarations of the options. When one of them changes, generate it again:
+The files are generated from the declarations of the options. When one of them changes, generate them again:
 
-    python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
+    python -m dlo_calibration.ros.parameter_file calibrator > config/calibrator.yaml
+    python -m dlo_calibration.ros.parameter_file planner > config/planner.yaml
 """
 
 from __future__ import annotations
@@ -14,29 +15,37 @@ from __future__ import annotations
 import json
 import sys
 import textwrap
+from typing import Mapping
 
-from dlo_calibration.calibration.declaration import Declaration
-from dlo_calibration.calibration.options import declarations
+from dlo_calibration.calibration.declaration import Declaration, DeclaredOptions
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.ros.planner_options import PlannerOptions
+
+NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot tell one from other empty lists
+
+#: name of a node -> its options
+NODES: Mapping[str, type[DeclaredOptions]] = {'calibrator': Options, 'planner': PlannerOptions}
 
 HEAD = """\
-All parameters of the node calibrator, with their defaults.  To change some, copy this file, edit the copy
+All parameters of the node {node}, with their defaults.  To change some, copy this file, edit the copy
 (a parameter that you leave out keeps its default), and start the node with it:
 
-    ros2 run dlo_calibration calibrator --ros-args --params-file my_calibrator.yaml
-    ros2 launch dlo_calibration calibrator.launch.py params_file:=my_calibrator.yaml
+    ros2 run dlo_calibration {node} --ros-args --params-file my_{node}.yaml
+    ros2 launch dlo_calibration {node}.launch.py params_file:=my_{node}.yaml
 
 The node does not start with an unknown name or a value out of range.
 
 This file is generated:
 
-    python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml
+    python -m dlo_calibration.ros.parameter_file {node} > config/{node}.yaml
 """
 
 
-def parameter_file() -> str:
-    """Return the text of the file."""
-    head = ''.join(f'# {line}'.rstrip() + '\n' for line in HEAD.splitlines())
-    return f'{head}\n/**:\n  ros__parameters:\n' + '\n'.join(_entry(d) for d in declarations())
+def parameter_file(node: str) -> str:
+    """Return the text of the file of a node in NODES."""
+    head = ''.join(f'# {line}'.rstrip() + '\n' for line in HEAD.format(node=node).splitlines())
+    return f'{head}\n/**:\n  ros__parameters:\n' + '\n'.join(
+        _entry(declaration) for declaration in NODES[node].declarations())
 
 
 def _entry(declaration: Declaration) -> str:
@@ -47,6 +56,9 @@ def _entry(declaration: Declaration) -> str:
     if allowed := _allowed(declaration):
         lines += textwrap.wrap(allowed, width, subsequent_indent='  ')
     value = list(declaration.default) if isinstance(declaration.default, tuple) else declaration.default
+    if value == []:
+        value = NO_TEXTS
+        lines.append('An empty list is written [""].')
     # JSON is valid YAML, and its types are unambiguous.
     return ''.join(f'    # {line}\n' for line in lines) + f'    {declaration.name}: {json.dumps(value)}\n'
 
@@ -64,4 +76,4 @@ def _allowed(declaration: Declaration) -> str:
 
 
 if __name__ == '__main__':
-    sys.stdout.write(parameter_file())
+    sys.stdout.write(parameter_file(*sys.argv[1:]))

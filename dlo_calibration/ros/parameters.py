@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-OptionsNode: a ROS node whose parameters are the options of the package.
+OptionsNode: a ROS node whose parameters are the options of a class.
 
 Names, types, descriptors and ranges come from the declarations of the options;
 unknown names and values out of range are refused.
@@ -10,30 +10,34 @@ unknown names and values out of range are refused.
 
 from __future__ import annotations
 
-from typing import Any, Mapping, Sequence
+from typing import Any, Generic, Mapping, Sequence, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dlo_calibration.calibration.declaration import Declaration
-from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.declaration import Declaration, DeclaredOptions
 from dlo_calibration.errors import InputError
+from dlo_calibration.ros.parameter_file import NO_TEXTS
 
 #: Beginnings of the names of the parameters that rclpy declares itself.
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
-DECLARED: Mapping[str, Declaration] = {declaration.name: declaration for declaration in declarations()}
+
+Chosen = TypeVar('Chosen', bound=DeclaredOptions)
 
 
-class OptionsNode(Node):
+class OptionsNode(Node, Generic[Chosen]):
     """
-    A node with the options as parameters.
+    A node with the options of a class as parameters.
 
+    :param kind: the class.
     :param arguments: of `rclpy.node.Node`, e.g. `parameter_overrides`.
     :raises InputError: for a parameter with an unknown name or a bad value.
     """
 
-    def __init__(self, name: str, **arguments: Any) -> None:
+    def __init__(self, name: str, kind: type[Chosen], **arguments: Any) -> None:
+        self._kind = kind
+        self._declared: Mapping[str, Declaration] = {one.name: one for one in kind.declarations()}
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **arguments)
         try:
             self._declare()
@@ -41,9 +45,9 @@ class OptionsNode(Node):
             self.destroy_node()
             raise
 
-    def options(self) -> Options:
+    def options(self) -> Chosen:
         """Return the options in force."""
-        return Options.of({name: _plain(self.get_parameter(name).value) for name in DECLARED})
+        return self._kind.of({name: _plain(self.get_parameter(name).value) for name in self._declared})
 
     def changed(self, names: Sequence[str]) -> None:
         """Do nothing; a subclass may override it to learn which parameters have new values."""
@@ -55,7 +59,7 @@ class OptionsNode(Node):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters together, as `rclpy.node.Node` does; a refusal is reported by `refuse`."""
         try:
-            _checked({**self.options().flat(), **{
+            self._checked({**self.options().flat(), **{
                 p.name: _plain(p.value) for p in parameter_list if not p.name.startswith(ROS_PARAMETERS)}})
         except InputError as error:
             self.refuse(str(error))
@@ -66,42 +70,54 @@ class OptionsNode(Node):
         """Declare the parameters; those that the user gave replace what rclpy declared without a range."""
         given = {name: _plain(one.value) for name, one in self.get_parameters_by_prefix('').items()
                  if not name.startswith(ROS_PARAMETERS)}
-        chosen = _checked(given)
+        chosen = self._checked(given)
         for name in given:
             self.undeclare_parameter(name)
         for name, value in chosen.flat().items():
-            self.declare_parameter(name, value, _descriptor(DECLARED[name]), ignore_override=True)
-        self.add_pre_set_parameters_callback(_as_declared)
+            self.declare_parameter(name, NO_TEXTS if value == [] else value,
+                                   _descriptor(self._declared[name]), ignore_override=True)
+        self.add_pre_set_parameters_callback(self._as_declared)
         self.add_on_set_parameters_callback(self._check)
 
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        new = {p.name: _plain(p.value) for p in parameters if p.name in DECLARED}
+        new = {p.name: _plain(p.value) for p in parameters if p.name in self._declared}
         try:
-            _checked({**self.options().flat(), **new})
+            self._checked({**self.options().flat(), **new})
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if new:
             self.changed(list(new))
         return SetParametersResult(successful=True)
 
+    def _checked(self, flat: Mapping[str, Any]) -> Chosen:
+        """Return options; raise InputError for a bad value, or for values that contradict each other."""
+        options = self._kind.of(flat)
+        options.check_together()
+        return options
 
-def _checked(flat: Mapping[str, Any]) -> Options:
-    """Return options; raise InputError for a bad value, or for values that contradict each other."""
-    options = Options.of(flat)
-    options.space  # checks several options together  # noqa: B018
-    return options
+    def _as_declared(self, parameters: list[Parameter]) -> list[Parameter]:
+        """
+        Convert parameters to the types of their declarations.
+
+        `ros2 param set` sends an integer for 1, and for [] a list of something else than texts.
+        """
+        return [_in_type_of(self._declared[p.name], p) if p.name in self._declared else p for p in parameters]
 
 
 def _plain(value: Any) -> Any:
-    """Return a parameter's value in the type that options expect; an array becomes a list."""
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
+    """Return a parameter's value in the type that options expect: a list for an array, empty for NO_TEXTS."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return [] if list(value) == NO_TEXTS else list(value)
 
 
-def _as_declared(parameters: list[Parameter]) -> list[Parameter]:
-    """Convert integers to floats where a float is declared: `ros2 param set` sends an integer for 1."""
-    return [Parameter(p.name, Parameter.Type.DOUBLE, float(p.value))
-            if p.type_ == Parameter.Type.INTEGER and p.name in DECLARED
-            and isinstance(DECLARED[p.name].default, float) else p for p in parameters]
+def _in_type_of(declaration: Declaration, given: Parameter) -> Parameter:
+    """Return a parameter in the type of its declaration where that means the same."""
+    if isinstance(declaration.default, float) and given.type_ == Parameter.Type.INTEGER:
+        return Parameter(given.name, Parameter.Type.DOUBLE, float(given.value))
+    if isinstance(declaration.default, tuple) and _plain(given.value) == []:
+        return Parameter(given.name, Parameter.Type.STRING_ARRAY, NO_TEXTS)
+    return given
 
 
 def _descriptor(declaration: Declaration) -> ParameterDescriptor:

@@ -10,32 +10,36 @@ import sys
 import pytest
 from ruamel.yaml import YAML
 
-from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.ros.parameter_file import parameter_file
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.ros.parameter_file import NO_TEXTS, NODES, parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / 'config' / 'calibrator.yaml'
+DECLARED = [(node, declaration) for node, kind in NODES.items() for declaration in kind.declarations()]
 
 
 def test_file_is_what_the_documented_command_makes():
-    done = subprocess.run([sys.executable, '-m', 'dlo_calibration.ros.parameter_file'], cwd=ROOT, check=True,
-                          capture_output=True, text=True)
-    assert done.stdout == FILE.read_text(encoding='utf-8'), \
-        'make it again: python -m dlo_calibration.ros.parameter_file > config/calibrator.yaml'
+    command = [sys.executable, '-m', 'dlo_calibration.ros.parameter_file', 'calibrator']
+    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert done.stdout == FILE.read_text(encoding='utf-8')
+    for node in NODES:
+        assert parameter_file(node) == (ROOT / 'config' / f'{node}.yaml').read_text(encoding='utf-8'), \
+            f'make it again: python -m dlo_calibration.ros.parameter_file {node} > config/{node}.yaml'
 
 
-def test_file_has_every_parameter_with_its_default():
-    values = YAML(typ='safe').load(parameter_file())['/**']['ros__parameters']
-    assert list(values) == [declaration.name for declaration in declarations()]
-    assert Options.of(values) == Options()
-    for declaration in declarations():
+@pytest.mark.parametrize('node, kind', NODES.items(), ids=NODES)
+def test_file_has_every_parameter_with_its_default(node, kind):
+    values = YAML(typ='safe').load(parameter_file(node))['/**']['ros__parameters']
+    assert list(values) == [declaration.name for declaration in kind.declarations()]
+    for declaration in kind.declarations():
         value = values[declaration.name]
         assert type(value) is (list if isinstance(declaration.default, tuple) else type(declaration.default))
+    assert kind.of({name: [] if value == NO_TEXTS else value for name, value in values.items()}) == kind()
 
 
-@pytest.mark.parametrize('declaration', list(declarations()), ids=lambda declaration: declaration.name)
-def test_comment_tells_meaning_unit_and_range(declaration):
-    lines = parameter_file().splitlines()
+@pytest.mark.parametrize('node, declaration', DECLARED, ids=lambda one: getattr(one, 'name', one))
+def test_comment_tells_meaning_unit_and_range(node, declaration):
+    lines = parameter_file(node).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith(f'    {declaration.name}: '))
     comment = []
     while (line := lines[at - 1 - len(comment)]).startswith('    # '):
@@ -53,7 +57,7 @@ def test_comment_tells_meaning_unit_and_range(declaration):
 
 
 def test_no_line_is_too_long_to_read():
-    assert max(len(line) for line in parameter_file().splitlines()) <= 110
+    assert max(len(line) for node in NODES for line in parameter_file(node).splitlines()) <= 110
 
 
 def test_node_starts_with_the_file_and_takes_what_was_changed_in_it(ros_environment, tmp_path):
