@@ -66,11 +66,17 @@ def difference_score(goal: Floats, current: Floats, reference: int,
     :param reference: index of the focal point p_ref.
     :param features: indices of the geometric features.
     """
+    return float(np.linalg.norm(difference_vector(goal, current, reference, features))) * 100
+
+
+def difference_vector(goal: Floats, current: Floats, reference: int,
+                      features: NDArray[np.intp] | Sequence[int]) -> Floats:
+    """Return the vector whose length is the difference score, (3,) [m]; see `difference_score`."""
     shape_goal = np.abs(goal[reference] - goal)
     shape_current = np.abs(current[reference] - current)
     shape = (shape_goal - shape_current).sum(axis=0)
     place = np.abs(goal[features] - current[features]).sum(axis=0)
-    return float(np.linalg.norm(shape + place)) * 100
+    return np.asarray(shape + place)
 
 
 class TrialScore:

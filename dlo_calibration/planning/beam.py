@@ -1,0 +1,295 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""BeamSearch: a search over sequences of moves, which asks for rehearsals and never simulates itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Generator, Mapping, Protocol, Sequence, TypeVar
+
+import numpy as np
+
+from dlo_calibration.model.action import Action
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.planning.crossings import crossings
+from dlo_calibration.planning.moves import carrying, Move
+from dlo_calibration.planning.objective import Objective
+from dlo_calibration.planning.options import PlanOptions
+from dlo_calibration.planning.refinement import Best, refine, Refinement, SHARES
+from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearsal, Step
+
+WIDTH = 3  # sequences that are continued
+KEPT = 4  # moves after each sequence that are refined
+ALIKE = 0.01  # of the length; of sequences that end nearer to each other, the better one is continued
+GAIN = 0.02  # share of the cost that an action must gain
+NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
+TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
+
+Result = TypeVar('Result')
+Asking = Generator[list[Job], Sequence[Rehearsal], Result]
+
+
+class Refusing(Protocol):
+    """Tells what the limits of the hands do not permit."""
+
+    def refusal(self, action: Action) -> str:
+        """Return why the hands must not move like this; empty if they may."""
+
+    def entered(self, chains: Floats) -> str:
+        """Return which forbidden box (m, n, 3) chains [m] enter; empty if none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """
+    A sequence of moves, and the DLO at rest before and after each.
+
+    :param chains: (k + 1, n, 3) [m] with the found parameters, the first one before the first move.
+    :param cost: of the last chain.
+    """
+
+    moves: tuple[Move, ...]
+    chains: Floats
+    cost: float
+
+    @property
+    def end(self) -> Floats:
+        """The chain after the last move, (n, 3) [m]."""
+        return np.asarray(self.chains[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """
+    Moves after a course that have not been simulated.
+
+    :param before: (k, n, 3) [m] where the DLO is expected before each of the k moves.
+    """
+
+    base: Course
+    moves: tuple[Move, ...]
+    before: Floats
+
+    def shifted(self, shifts: Floats) -> Draft:
+        """Return the same moves with other displacements, (d,) [m] one after the other."""
+        parts = np.split(shifts, np.cumsum([move.shifts.size for move in self.moves])[:-1])
+        return replace(self, moves=tuple(replace(move, shifts=part)
+                                         for move, part in zip(self.moves, parts, strict=True)))
+
+    @property
+    def shifts(self) -> Floats:
+        """All displacements, (d,) [m]."""
+        return np.concatenate([move.shifts.ravel() for move in self.moves])
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """
+    A course that was simulated at once, with the found parameters and with draws from the posterior.
+
+    :param best: with the found parameters; `drawn` with the draws.
+    :param cost: mean over the draws.
+    """
+
+    course: Course
+    steps: tuple[Step, ...]
+    best: Rehearsal
+    drawn: tuple[Rehearsal, ...]
+    cost: float
+
+
+class BeamSearch:
+    """
+    Search for the shortest sequence of moves that reaches a goal, or the one that gets nearest.
+
+    Each sequence is continued by the moves that carry a point to its place in the goal.  The best of them
+    are refined, and the best sequences are continued.  All displacements of a sequence that nearly
+    reaches the goal are refined together.
+
+    :param start: the DLO before the first move.
+    :param level: height [m] at which points are put down.
+    :param physical: found parameters; `draws` from the posterior (SI units).
+    """
+
+    def __init__(self, start: Chain, objective: Objective, options: PlanOptions, limits: Refusing,
+                 level: float, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]) -> None:
+        self._start, self._length = start, start.length
+        self._objective, self._options, self._limits = objective, options, limits
+        self._level, self._physical, self._draws = level, physical, draws
+        self._crossings = max(crossings(start.points), crossings(objective.goal))
+        self._root = Course((), start.points[None], objective.cost(start.points))
+        self.best: Course = self._root  # the most promising sequence so far
+        self.judged: Judged | None = None  # the best one that was simulated with draws
+        self.refusals: dict[str, int] = {}  # why moves were refused -> how often
+        self.stop_reason = ''
+        self._asking = self._search()
+        self._jobs: list[Job] = next(self._asking, [])
+
+    @property
+    def depth(self) -> int:
+        """Number of actions of the sequences that are tried now."""
+        return len(self.best.moves) + 1
+
+    def ask(self) -> list[Job]:
+        """Return sequences to rehearse; none once the search has ended."""
+        return self._jobs
+
+    def tell(self, rehearsals: Sequence[Rehearsal]) -> None:
+        """Take the rehearsals of the last `ask`, in the order asked."""
+        try:
+            self._jobs = self._asking.send(rehearsals)
+        except StopIteration:
+            self._jobs = []
+
+    def stop(self) -> None:
+        """Ask from now on only for what the best sequence so far needs to be a plan."""
+        self._asking = self._conclude('stopped')
+        self._jobs = next(self._asking, [])
+
+    @property
+    def expected(self) -> int:
+        """Number of actions to simulate if all permitted actions are needed; an estimate."""
+        actions = self._options.actions
+        moves = len(carrying(self._start.points, self._objective.goal, self._options.kinds,
+                             self._options.hands))
+        following = moves + KEPT * (2 * self._options.hands + len(SHARES))
+        displacements = 2 * actions * self._options.hands
+        return int(following * (1 + WIDTH * (actions - 1))
+                   + actions * (displacements + TOGETHER * len(SHARES) + 1 + len(self._draws)))
+
+    def _conclude(self, reason: str) -> Asking[None]:
+        """Judge the best sequence so far, unless it is judged."""
+        if self.best.moves and (self.judged is None or self.judged.course is not self.best):
+            yield from self._judge(self.best)
+        self.stop_reason = reason
+
+    def _search(self) -> Asking[None]:
+        if self._root.cost <= self._objective.enough:
+            self.stop_reason = 'the start is within the tolerance of the goal'
+            return
+        beam, reason = [self._root], f'the largest number of actions, {self._options.actions}'
+        while len(self.best.moves) < self._options.actions:
+            beam = yield from self._grown(beam)
+            if not beam or beam[0].cost > (1 - GAIN) * self.best.cost:
+                reason = 'no further action brings it nearer'
+                break
+            self.best = beam[0]
+            last = len(self.best.moves) == self._options.actions
+            if self.best.cost < NEAR * self._objective.enough or last:
+                self.best = beam[0] = yield from self._together(self.best)
+                if self.best.cost <= self._objective.enough and (
+                        yield from self._judge(self.best)) <= self._objective.enough:
+                    reason = 'the goal is reached'
+                    break
+        yield from self._conclude(reason)
+
+    def _grown(self, beam: Sequence[Course]) -> Asking[list[Course]]:
+        """Return the best sequences with one more move, best first."""
+        drafts = []
+        for course in beam:
+            for choices in carrying(course.end, self._objective.goal, self._options.kinds,
+                                    self._options.hands):
+                permitted = [draft for move in choices
+                             if self._permits(draft := Draft(course, (move,), course.chains[-1:]))]
+                drafts += permitted[:1]
+        seen = yield from self._tried(drafts)
+        first: list[tuple[Course, Course, Draft]] = []
+        for draft, one in zip(drafts, seen, strict=True):
+            if one is not None:
+                first.append((draft.base, one, draft))
+        chosen = []
+        for course in beam:
+            own = sorted((entry for entry in first if entry[0] is course), key=lambda entry: entry[1].cost)
+            chosen += own[:KEPT]
+        refined = yield from self._refined([entry[2] for entry in chosen], [entry[1] for entry in chosen], 1)
+        return self._distinct(sorted(refined, key=lambda course: course.cost))[:WIDTH]
+
+    def _distinct(self, courses: Sequence[Course]) -> list[Course]:
+        found: list[Course] = []
+        for course in courses:
+            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * self._length
+                   for other in found):
+                found.append(course)
+        return found
+
+    def _together(self, course: Course) -> Asking[Course]:
+        """Return a sequence whose displacements were refined all at once."""
+        draft = Draft(self._root, course.moves, course.chains[:-1])
+        found, = yield from self._refined([draft], [course], TOGETHER)
+        return found if found.cost < course.cost else course
+
+    def _refined(self, drafts: Sequence[Draft], seen: Sequence[Course], iterations: int
+                 ) -> Asking[list[Course]]:
+        """Refine the displacements of drafts, which were seen to become courses, side by side."""
+        under_way: dict[int, tuple[Refinement[Course], list[Floats]]] = {}
+        best = list(seen)
+        for k, (draft, course) in enumerate(zip(drafts, seen, strict=True)):
+            refinement = refine(Best(draft.shifts, course), lambda one: self._objective.residuals(one.end),
+                                iterations)
+            under_way[k] = refinement, next(refinement)
+        while under_way:
+            asked = [(k, drafts[k].shifted(point))
+                     for k, (_, points) in under_way.items() for point in points]
+            told = yield from self._tried([draft for _, draft in asked])
+            for k, (refinement, _) in list(under_way.items()):
+                own = [one for (index, _), one in zip(asked, told, strict=True) if index == k]
+                best[k] = min([best[k], *(one for one in own if one is not None)], key=lambda one: one.cost)
+                try:
+                    under_way[k] = refinement, refinement.send(own)
+                except StopIteration:
+                    del under_way[k]
+        return best
+
+    def _tried(self, drafts: Sequence[Draft]) -> Asking[list[Course | None]]:
+        """Return the courses that drafts become; None where one is not permitted or cannot be simulated."""
+        permitted = [draft for draft in drafts if self._permits(draft)]
+        jobs = [Job(self._chain(draft.base), self._steps(draft.moves, draft.before), self._physical,
+                    courses=bool(self._options.no_go)) for draft in permitted]
+        told = (yield jobs) if jobs else []
+        found = {id(draft): self._course(draft, one) for draft, one in zip(permitted, told, strict=True)}
+        return [found.get(id(draft)) for draft in drafts]
+
+    def _chain(self, course: Course) -> Chain:
+        return self._start if not course.moves else Chain(course.end)
+
+    def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[Step, ...]:
+        return in_turn([move.step(points, self._level, self._options.height, self._options.speed)
+                        for move, points in zip(moves, before, strict=True)])
+
+    def _permits(self, draft: Draft) -> bool:
+        for step in self._steps(draft.moves, draft.before):
+            if not self._allowed(self._limits.refusal(step.action)):
+                return False
+        return True
+
+    def _allowed(self, refusal: str) -> bool:
+        """Count a refusal; tell whether there was none."""
+        if refusal:
+            self.refusals[refusal] = self.refusals.get(refusal, 0) + 1
+        return not refusal
+
+    def _course(self, draft: Draft, seen: Rehearsal) -> Course | None:
+        """Return the course that a draft becomes; None if it failed or is not permitted."""
+        if seen.failure:
+            return None
+        for course in seen.courses:
+            if not self._allowed(self._limits.entered(course)):
+                return None
+        if not self._options.crossings and any(crossings(chain) > self._crossings for chain in seen.chains):
+            self._allowed('the DLO would cross itself')
+            return None
+        return Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
+                      self._objective.cost(seen.chains[-1]))
+
+    def _judge(self, course: Course) -> Asking[float]:
+        """Simulate a course at once, with the found parameters and with the draws; return its mean cost."""
+        steps = self._steps(course.moves, course.chains[:-1])
+        best, *drawn = yield [Job(self._start, steps, physical)
+                              for physical in (self._physical, *self._draws)]
+        drawn = [one for one in drawn if not one.failure]
+        costs = [self._objective.cost(one.chains[-1]) for one in drawn or [best]]
+        judged = Judged(course, steps, best, tuple(drawn), float(np.mean(costs)))
+        if not best.failure and (self.judged is None or judged.cost < (1 - GAIN) * self.judged.cost):
+            self.judged = judged
+        return judged.cost
