@@ -9,8 +9,8 @@ What will happen, and how to get there: predictions of actions, and plans from o
 
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
 from dlo_calibration.planning.plan import Plan, PlannedAction
-from dlo_calibration.planning.planner import plan, PlanProgress
+from dlo_calibration.planning.planner import PlanProgress
 from dlo_calibration.planning.rehearsal import Job, Rehearsal, Rehearser, Step
 
-__all__ = ['CalibratedDlo', 'Job', 'Plan', 'plan', 'PlannedAction', 'PlanProgress', 'Posterior', 'Rehearsal',
+__all__ = ['CalibratedDlo', 'Job', 'Plan', 'PlannedAction', 'PlanProgress', 'Posterior', 'Rehearsal',
            'Rehearser', 'Step']
