@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 
+HANGING = 0.04  # m; a DLO whose lowest points are so much above the table hangs
 RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
 STACKED = 0.0015  # m; of two strands that cross, one that is so much higher lies on the other
 RISEN = 0.25  # share of its height above the other strand from which on the upper one keeps its height
@@ -26,14 +27,21 @@ def resting_level(trial: Trial, table_height: float) -> float | None:
     """
     chains: list[Chain] = [trial.initial] if trial.velocity is None else []
     chains += [goal.chain for goal in trial.goals if goal.stable]
-    levels = []
-    for chain in chains:
-        z = chain.points[:, 2]
-        lowest = z[z < z.min() + RESTING_BAND]
-        if len(lowest) >= max(3, 0.15 * len(z)):
-            levels.append(float(np.median(lowest)))
-    level = min(levels, default=np.inf)
-    return level if level - table_height < 0.04 else None
+    level = min((_lowest_level(chain) for chain in chains), default=np.inf)
+    return level if level - table_height < HANGING else None
+
+
+def lying_level(chain: Chain, table_height: float) -> float | None:
+    """Return the height [m] at which one chain lies on the table, as `resting_level`; None if it hangs."""
+    level = _lowest_level(chain)
+    return level if level - table_height < HANGING else None
+
+
+def _lowest_level(chain: Chain) -> float:
+    """Return the median height [m] of the lowest points of a chain; infinity if there are too few of them."""
+    z = chain.points[:, 2]
+    lowest = z[z < z.min() + RESTING_BAND]
+    return float(np.median(lowest)) if len(lowest) >= max(3, 0.15 * len(z)) else np.inf
 
 
 def rest_on(points: Floats, level: float) -> Floats:

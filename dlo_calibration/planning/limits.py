@@ -55,15 +55,17 @@ class Limits:
 
     def entered(self, chains: Floats) -> str:
         """
-        Say which box the DLO enters.
+        Say that the DLO enters a box.
 
         :param chains: (m, n, 3) [m] the DLO at m instants.
-        :returns: a phrase such as 'the DLO enters the no-go box 0 0 0 1 1 1'; empty if there is none.
+        :returns: a phrase such as 'the DLO enters the no-go box 0 0 0 1 1 1'; empty if it enters none.
         """
-        if not self.no_go:
-            return ''
-        box = self._box(chains[:, :-1].reshape(-1, 3), chains[:, 1:].reshape(-1, 3))
+        box = self.box(chains)
         return box and f'the DLO enters the no-go box {box}'
+
+    def box(self, chains: Floats) -> str:
+        """Return the text of the first box that the DLO enters in one of its chains, (m, n, 3) [m]."""
+        return self._box(chains[:, :-1].reshape(-1, 3), chains[:, 1:].reshape(-1, 3)) if self.no_go else ''
 
     def _box(self, begin: Floats, end: Floats) -> str:
         """Return the text of the first box that one of the straight ways enters; empty if there is none."""
