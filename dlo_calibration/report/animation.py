@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Callable, Mapping, Sequence
 
@@ -22,18 +23,36 @@ from dlo_calibration.writing import Attempts, whole
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
 
 
-def write_animation(trial: Trial, motion: Motion, path: str | Path) -> None:
+@dataclass(frozen=True)
+class Captions:
     """
-    Write a GIF with the simulated motion and the measured goal, from above (left) and from the side (right).
+    What the parts of an animation are called.
 
+    :param title: begins the title.
+    :param start: the initial chain.
+    :param goal: the last goal chain; empty: it is not drawn.
+    """
+
+    title: str
+    start: str = 'before the action, measured'
+    goal: str = 'after the action, measured'
+
+
+def write_animation(trial: Trial, motion: Motion, path: str | Path,
+                    captions: Captions | None = None) -> None:
+    """
+    Write a GIF with the simulated motion and the goal, from above (left) and from the side (right).
+
+    :param captions: None: the chains of the trial were measured.
     :raises InputError: if the file cannot be written.
     """
     from matplotlib.animation import PillowWriter
 
     speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
-    writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': f'{trial.name}, simulated'})
+    captions = captions or Captions(f'{trial.name}, simulated')
+    writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': captions.title})
     with whole(Path(path)) as new, settings():
-        scene = _Scene(trial, motion, speed)
+        scene = _Scene(trial, motion, speed, captions)
         with writer.saving(scene.figure, str(new), dpi=DOTS_PER_INCH):
             for time, chain in zip(motion.times, motion.chains, strict=True):
                 scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
@@ -66,9 +85,10 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
 class _Scene:
     """A figure in which only the simulated chain and the hands move."""
 
-    def __init__(self, trial: Trial, motion: Motion, speed: float) -> None:
+    def __init__(self, trial: Trial, motion: Motion, speed: float, captions: Captions) -> None:
         self.figure = blank_figure(10.5, 4.8)
         self._trial = trial
+        self._captions = captions
         self._speed = '' if speed < 1.05 else f', {number(speed)} times as fast as in reality'
         self._colours = hand_colours([trial])
         self._moving: list[tuple[View, Any, Any, Mapping[str, Any]]] = []
@@ -82,11 +102,11 @@ class _Scene:
         self.figure.set_layout_engine('none')  # a new layout for each frame would move the axes
 
     def _prepare(self, view: View, motion: Motion) -> tuple[View, Any, Any, Mapping[str, Any]]:
-        view.draw_start()
+        view.draw_start(self._captions.start)
+        goal = self._trial.goals[-1].chain.points if self._captions.goal else np.full((1, 3), np.nan)
         measured, = view.axes.plot(
-            *view.flat(self._trial.goals[-1].chain.points), 'o', color=OBSERVED, markersize=4,
-            alpha=0.5, linestyle='none', zorder=2,
-            label='latest measured chain' if self._tracked else 'after the action, measured')
+            *view.flat(goal), 'o', color=OBSERVED, markersize=4, alpha=0.5, linestyle='none', zorder=2,
+            label='latest measured chain' if self._tracked else self._captions.goal or None)
         line, = view.axes.plot(*view.flat(motion.chains[0]), 'o-', color=SIMULATED, linewidth=2.5,
                                markersize=3, label='simulated', zorder=3)
         hands = {}
@@ -103,7 +123,7 @@ class _Scene:
 
     def show(self, time: float, chain: Floats, when: str) -> None:
         """Show the chain and the hands at a time of the trial [s]; `when` goes into the title."""
-        self._title.set_text(as_text(f'{self._trial.name}, simulated: {when}{self._speed}'))
+        self._title.set_text(as_text(f'{self._captions.title}: {when}{self._speed}'))
         holding = {hand.name for hand in self._trial.holding(self._goal_at(time))}
         begun = [hand for hand in self._trial.hands if hand.start <= time]
         current = {**{hand.name: hand for hand in reversed(self._trial.hands)},

@@ -23,6 +23,7 @@ from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.figure import (
     add_legend,
     as_text,
+    BAND,
     BEFORE,
     blank_figure,
     BLUE,
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99')
+CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a square, in turn
 INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # of goals in motion, early to late
 
 
@@ -197,10 +199,27 @@ class View:
         flat: Floats = self._projection @ np.asarray(points).T
         return flat
 
-    def draw_start(self) -> None:
+    def draw_start(self, label: str = 'before the action, measured') -> None:
         """Draw the DLO before the action."""
-        self.axes.plot(*self.flat(self.trial.initial.points), '-', color=BEFORE, linewidth=3,
-                       label='before the action, measured', zorder=1)
+        self.axes.plot(*self.flat(self.trial.initial.points), '-', color=BEFORE, linewidth=3, label=label,
+                       zorder=1)
+
+    def draw_band(self, lower: Floats, upper: Floats, label: str) -> None:
+        """
+        Shade where the DLO may be.
+
+        :param lower: (n, 3) [m] lower ends of the intervals of the coordinates; `upper` (n, 3) upper ends.
+        """
+        from matplotlib.collections import PolyCollection
+
+        middle, half = self.flat((lower + upper) / 2), np.abs(self._projection) @ (upper - lower).T / 2
+        corners = (middle[None] + half[None] * CORNERS[:, :, None]).transpose(2, 0, 1)  # (n, 4, 2) [m]
+        after = np.roll(corners, -1, axis=1)
+        # An interval that moves from one point to the next sweeps what its four edges sweep.
+        swept = np.stack([corners[:-1], after[:-1], after[1:], corners[1:]], axis=2).reshape(-1, 4, 2)
+        # One colour without transparency, as the pieces overlap; edges close the gaps between them.
+        self.axes.add_collection(PolyCollection(
+            [*corners, *swept], facecolor=BAND, edgecolor=BAND, linewidth=0.3, zorder=0.5, label=label))
 
     def draw_goal(self, index: int, simulated: Floats | None, colour: str | None) -> None:
         """
