@@ -161,8 +161,8 @@ def _remarks_on_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
     if each.mean() > options.tolerance / 100 * goal.length / 2:
         worst = int(away.mean(axis=0).argmax())
         yield (f'laid exactly on the goal and let go, the DLO springs back by {_mm(each.mean())} on average '
-               f'({each.mean() / goal.length:.1%} of the length; {_mm(each.min())} to {_mm(each.max())} within '
-               f'the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at '
+               f'({each.mean() / goal.length:.1%} of the length; {_mm(each.min())} to {_mm(each.max())} '
+               f'within the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at '
                f'{at[worst]:.2f} of the length: it is stiffer than friction can hold there')
 
 
