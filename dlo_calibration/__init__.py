@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from dlo_calibration.model.action import Action, Hand
     from dlo_calibration.model.chain import Chain
     from dlo_calibration.model.trial import Goal, Trial
+    from dlo_calibration.planning.options import PlanOptions
+    from dlo_calibration.planning.planner import plan
     from dlo_calibration.simulation.bullet import BulletRope
 
 __all__ = [
     'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'EvaluationLog', 'Goal', 'Hand',
-    'InputError', 'Options', 'SimulationError', 'Trial', 'calibrate', 'read_result', 'read_session',
+    'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'plan', 'read_result',
+    'read_session',
 ]
 
 _MODULES = {
@@ -35,6 +38,8 @@ _MODULES = {
     'model.trial': ('Goal', 'Trial'),
     'calibration.options': ('Options',),
     'calibration.calibrate': ('calibrate',),
+    'planning.options': ('PlanOptions',),
+    'planning.planner': ('plan',),
     'evaluation.log': ('EvaluationLog',),
     'files.session': ('read_session',),
     'files.result': ('read_result',),

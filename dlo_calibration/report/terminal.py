@@ -19,6 +19,7 @@ from dlo_calibration.errors import shortened, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
+from dlo_calibration.planning.planner import PlanProgress
 from dlo_calibration.report import sentences
 
 LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
@@ -101,6 +102,36 @@ class TaskBar:
     def advance(self) -> None:
         """Count one more."""
         self._progress.advance(self._task)
+
+
+class PlanBar:
+    """
+    A progress bar of a plan on a terminal, with the time left; elsewhere nothing is shown.
+
+    :param shown: False: nothing is shown on a terminal, either.
+    """
+
+    def __init__(self, stream: TextIO, shown: bool = True) -> None:
+        self._progress = Progress(
+            TextColumn('planning action {task.fields[action]}'), BarColumn(), MofNCompleteColumn(),
+            TextColumn('best error {task.fields[best]}, at most {task.fields[left]} s left'),
+            console=console(stream), disable=not (shown and stream.isatty()))
+        self._task = self._progress.add_task('', total=None, action=1, best='-', left='-')
+
+    def __enter__(self) -> PlanBar:
+        """Show it."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop updating; the bar stays visible."""
+        self._progress.stop()
+
+    def take(self, progress: PlanProgress) -> None:
+        """Show how far the plan is."""
+        self._progress.update(
+            self._task, completed=progress.rollouts, total=progress.expected, action=progress.actions,
+            best=measured(progress.best_error, 'm'), left=f'{progress.seconds_left:.0f}')
 
 
 def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
