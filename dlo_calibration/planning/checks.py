@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Iterator
 
 import numpy as np
@@ -89,18 +90,19 @@ def _check_dlo(found: CalibratedDlo) -> None:
 def _check_length(thing: str, chain: Chain, length: float, whose: str) -> None:
     if not abs(chain.length / length - 1) <= OTHER_LENGTH:
         raise InputError(thing, f'a length of {_mm(chain.length)}',
-                         f'that of {whose}, {_mm(length)}, within {OTHER_LENGTH:.0%}',
+                         f'that of {whose}, {_mm(length)}, within {100 * OTHER_LENGTH:.0f} %',
                          'send metres, and the whole of the same DLO')
 
 
 def _level(thing: str, chain: Chain, table_height: float) -> float:
     """Return the height [m] at which a chain lies on the table; raise the InputError if it does not."""
     level, z = lying_level(chain, table_height), chain.points[:, 2]
-    if level is None or z.max() - level > HANGING:
+    # A strand that lies on another one is higher by the diameter.
+    if level is None or z.max() - level > HANGING + 2 * max(level - table_height, 0.0):
         raise InputError(
             thing, f'points {1e3 * (z.min() - table_height):.0f} to {1e3 * (z.max() - table_height):.0f} mm '
-            'above the table', f'a DLO that lies on it, as hands open after each action, {_mm(HANGING)} high '
-            'at most', 'lay it down, or correct table_height')
+            'above the table', 'a DLO that lies on the table, as hands open after each action',
+            'lay it down, or correct table_height')
     return level
 
 
@@ -111,15 +113,16 @@ def _matched(goal: Chain, start: Chain, rise: float) -> Chain:
         goal.arc_lengths() / goal.length - fractions).max() <= ELSEWHERE
     if same and rise == 0:
         return goal
-    points = goal.points if same else goal.resample(fractions * goal.length)
-    return Chain(points + np.array([0.0, 0.0, rise]))
+    up = np.array([0.0, 0.0, rise])
+    return replace(goal, points=goal.points + up) if same else Chain(
+        goal.resample(fractions * goal.length) + up)
 
 
 def _remarks_on_length(start: Chain, goal: Chain, tolerance: float) -> Iterator[str]:
     """Compare the lengths: if both middles coincide, a point is |s - 1/2| of the difference off, s = 0..1."""
     longer = goal.length - start.length
     if abs(longer) > tolerance * start.length:
-        yield (f'the goal is {abs(longer) / start.length:.1%} {"longer" if longer > 0 else "shorter"} than '
+        yield (f'the goal is {_percent(longer, start)} {"longer" if longer > 0 else "shorter"} than '
                f'the DLO, {_mm(goal.length)} instead of {_mm(start.length)}, so its points stay about '
                f'{_mm(abs(longer) / 4)} away from the goal on average')
 
@@ -161,9 +164,13 @@ def _remarks_on_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
     if each.mean() > options.tolerance / 100 * goal.length / 2:
         worst = int(away.mean(axis=0).argmax())
         yield (f'laid exactly on the goal and let go, the DLO springs back by {_mm(each.mean())} on average '
-               f'({each.mean() / goal.length:.1%} of the length; {_mm(each.min())} to {_mm(each.max())} '
-               f'within the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at '
-               f'{at[worst]:.2f} of the length: it is stiffer than friction can hold there')
+               f'({_percent(each.mean(), goal)} of the length; {_mm(each.min())} to {_mm(each.max())} within '
+               f'the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at {at[worst]:.2f} '
+               'of the length: it is stiffer than friction can hold there')
+
+
+def _percent(length: float, chain: Chain) -> str:
+    return f'{100 * abs(length) / chain.length:.1f} %'
 
 
 def _mm(length: float) -> str:
