@@ -10,7 +10,8 @@ starts from the latest observed chain before it: the initial one, or a goal chai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 import re
@@ -39,11 +40,11 @@ from dlo_calibration.files.xml import (
 )
 from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.manipulation import in_steps, Manipulation, PATHS, Timed
 from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
 from dlo_calibration.model.trial import Goal, Trial
 
 WHAT = 'request'  # in errors
-PATHS = 'hand_paths'  # element of explicit paths
 TURNS = ('qx', 'qy', 'qz', 'qw')  # attributes of a waypoint
 
 
@@ -69,6 +70,7 @@ class TrialRequest:
     A trial of a request.
 
     :param actions: named actions, or explicit paths of hands.
+    :param goals: may be empty: such a trial can be simulated, but shows no parameter.
     :param velocity: (n, 3) [m/s] of the initial points; None: at rest.
     """
 
@@ -88,7 +90,10 @@ class TrialRequest:
             if not re.fullmatch(r'[^\s\x00-\x1f\ud800-\udfff\ufffe\uffff]{1,100}', name):
                 raise InputError(f'trial {self.name!r}', f'a hand named {name!r}',
                                  'at most 100 characters without blanks', 'choose another name')
-        self.trial()
+        if self.goals:
+            self.trial()
+        else:
+            self.manipulation()
 
     @classmethod
     def of(cls, trial: Trial) -> TrialRequest:
@@ -106,11 +111,9 @@ class TrialRequest:
         """
         done: list[Action] = []
         holds: list[tuple[float, tuple[str, ...], bool]] = []
-        for one in sorted(self.actions, key=lambda action: action.start):
+        for one in self._in_order():
             if isinstance(one, NamedAction):
-                seen = [goal for goal in self.goals if goal.time <= one.start]
-                chain = max(seen, key=lambda goal: goal.time).chain if seen else self.initial
-                action, hold = one.action(chain, done), one.hold
+                action, hold = one.action(self._seen(one.start), done), one.hold
             else:
                 action, hold = one, not release
             done.append(action)
@@ -123,6 +126,38 @@ class TrialRequest:
                 held_by = tuple(name for name, hold in last.items() if hold)
             goals.append(Goal(goal.chain, goal.time, goal.stable, held_by))
         return Trial(self.name, self.initial, tuple(done), tuple(goals), self.velocity)
+
+    def manipulation(self, release: bool = True) -> Manipulation:
+        """
+        Return what the hands do, in which named actions wait for the predicted chain.
+
+        :param release: as of `trial`.
+        """
+        done: list[Action] = []
+        timed = []
+        for one in self._in_order():
+            end, hold = one.start, not release
+            if isinstance(one, NamedAction):
+                hold = one.hold
+                with suppress(InputError):  # it may be possible with the predicted chain
+                    done.append(one.action(self._seen(one.start), done))
+                    end = done[-1].end
+            else:
+                done.append(one)
+                end = one.end
+            timed.append(Timed(one, end, hold))
+        goals = sorted(self.goals, key=lambda goal: goal.time)
+        found = in_steps(self.name, self.initial, timed, [(goal.time, goal.held_by) for goal in goals])
+        return found if self.velocity is None else replace(found, remarks=(
+            *found.remarks, f'trial {self.name!r}: the DLO begins at rest, not with the given velocity'))
+
+    def _in_order(self) -> list[Union[NamedAction, Action]]:
+        return sorted(self.actions, key=lambda action: action.start)
+
+    def _seen(self, time: float) -> Chain:
+        """Return the latest chain that was observed until a time [s]."""
+        seen = [goal for goal in self.goals if goal.time <= time]
+        return max(seen, key=lambda goal: goal.time).chain if seen else self.initial
 
 
 @dataclass(frozen=True)
@@ -225,6 +260,11 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
     """
     trials, refusals = [], []
     for one in request.trials:
+        if not one.goals:
+            refusals.append(str(InputError(
+                f'trial {one.name!r}', 'no goal chain', 'at least one',
+                'observe the DLO after the action, or predict it with dlo-calibration simulate')))
+            continue
         trial = one.trial(options.release)
         length = trial.initial.length
         change = max(abs(goal.chain.length - length) / length * 100 for goal in trial.goals)
@@ -236,6 +276,15 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
         else:
             trials.append(trial)
     return tuple(trials), tuple(refusals)
+
+
+def request_manipulations(request: Request, options: Options) -> tuple[Manipulation, ...]:
+    """
+    Return what the hands do in each trial of a request, with or without goal chains.
+
+    :param options: `release` is used.
+    """
+    return tuple(one.manipulation(options.release) for one in request.trials)
 
 
 def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from dlo_calibration.messages.codec import (
     ActionMessage,
     bag_types,
     chain_cloud,
+    GOAL,
     INPUT_TYPES,
     read,
 )
@@ -37,6 +38,7 @@ from dlo_calibration.messages.refusals import counted
 from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Key, Message
 from dlo_calibration.messages.trial_builder import order as order_of
+from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
 
@@ -129,8 +131,37 @@ def trial_records(trials: Iterable[Trial], frame_id: str = 'world') -> tuple[Rec
 
 def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
     """Return the complete trials of a session, and the reasons why messages are not used, each once."""
+    clocks, refusals = _by_clock(session)
+    trials: list[Trial] = []
+    for messages in clocks:
+        collector, refused = _collected(messages, options)
+        trials += collector.trials
+        refusals += [text for _, text in refused]
+        refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
+    named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
+    return tuple(named), counted(refusals)
+
+
+def session_manipulations(session: Session,
+                          options: Options) -> tuple[tuple[Manipulation, ...], tuple[str, ...]]:
+    """Return what the hands did in a session, with or without goal chains, and why messages are not used."""
+    clocks, refusals = _by_clock(session)
+    found: list[Manipulation] = []
+    for messages in clocks:
+        collector, refused = _collected(messages, options)
+        some, problems = collector.manipulations()
+        found += some
+        judged = {str(problem) for problem in collector.problems}  # `problems` has those that hold here
+        refusals += [text for kind, text in refused if kind != GOAL and text not in judged]
+        refusals += map(str, problems)
+    named = (replace(one, name=f'trial {k}') for k, one in enumerate(found, start=1))
+    return tuple(named), counted(refusals)
+
+
+def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
+    """Return the messages before and after each jump of the clock, and why others are not used."""
     order, refusals = StampOrder(), []
-    clocks: list[list[Message]] = [[]]  # the messages before and after each jump of the clock
+    clocks: list[list[Message]] = [[]]
     for kind, message in session.messages:
         try:
             one = read(kind, message)
@@ -148,24 +179,21 @@ def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...
             clocks.append([])
         order.add(one)
         clocks[-1].append(one)
-    trials: list[Trial] = []
     known: dict[Key, Message] = {}
-    for messages in clocks:
+    for k, messages in enumerate(clocks):
         fresh = [one for one in messages
                  if order_of(one) not in known or not _same(one, known[order_of(one)])]
         if len(fresh) < len(messages):
             refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat '
                             'earlier ones: a recording that was played again is no second observation')
         known |= {order_of(one): one for one in messages}
-        found, problems = _collected(fresh, options)
-        trials += found
-        refusals += problems
-    named = (replace(trial, name=f'trial {k}') for k, trial in enumerate(trials, start=1))
-    return tuple(named), counted(refusals)
+        clocks[k] = fresh
+    return clocks, refusals
 
 
-def _collected(messages: Iterable[Message], options: Options) -> tuple[tuple[Trial, ...], list[str]]:
-    """Return the trials in messages with stamps of one clock, and why messages are not used."""
+def _collected(messages: Iterable[Message],
+               options: Options) -> tuple[TrialCollector, list[tuple[str, str]]]:
+    """Collect messages with stamps of one clock; also return the kinds of those refused, and why."""
     collector = TrialCollector(options)
     refusals = []
     # The trials do not depend on the order of arrival.
@@ -173,12 +201,11 @@ def _collected(messages: Iterable[Message], options: Options) -> tuple[tuple[Tri
         try:
             collector.add(one)
         except InputError as error:
-            refusals.append(str(error))
+            refusals.append((one.kind, str(error)))
         except Exception as error:  # a defect of this package must not cost the other messages
-            refusals.append(f'{one}: could not be used ({error!r}); {DEFECT}')
-        refusals += [str(refusal) for refusal in collector.take_news()]
-    refusals += [str(problem) for problem in (*collector.problems, *collector.loose_end)]
-    return collector.trials, refusals
+            refusals.append((one.kind, f'{one}: could not be used ({error!r}); {DEFECT}'))
+        refusals += [(one.kind, str(refusal)) for refusal in collector.take_news()]
+    return collector, refusals
 
 
 def _same(one: Message, other: Message) -> bool:

@@ -45,7 +45,9 @@ from typing import Iterable
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ActionMessage, INITIAL
+from dlo_calibration.messages.manipulations import manipulation_of
 from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
+from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
@@ -123,6 +125,20 @@ class TrialCollector:
         """The complete trials in the order of their stamps: ``trial 1``, ``trial 2``, ..."""
         complete = [builder for builder in self._builders if builder.complete]
         return tuple(builder.build(f'trial {k}') for k, builder in enumerate(complete, start=1))
+
+    def manipulations(self) -> tuple[tuple[Manipulation, ...], tuple[InputError, ...]]:
+        """
+        Return what the hands did in each trial, also in those without a goal chain.
+
+        They are called ``trial 1``, ``trial 2``, ...; the errors tell why actions are not used.
+        """
+        found: list[Manipulation] = []
+        problems: list[InputError] = []
+        for builder in self._builders[1:]:
+            one, errors = manipulation_of(builder, f'trial {len(found) + 1}', self._options)
+            found += [] if one is None else [one]
+            problems += errors
+        return tuple(found), (*problems, *(self._orphans() if len(self._builders) == 1 else ()))
 
     @property
     def frame_id(self) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
-from typing import Iterable, Union
+from typing import Iterable, Sequence, Union
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
 
 Message = Union[ChainMessage, ActionMessage]
@@ -134,26 +134,23 @@ class TrialBuilder:
             latest, numbered = self.views[-1].message, self.views[-1].names
         chain = latest.chain
         grips: list[tuple[int, ...]] = []
-        for name, position in zip(action.names, action.positions[0], strict=True):
-            held = np.zeros(0, int)
-            if chain.hands is not None and name in numbered:
-                held = np.flatnonzero(chain.hands == numbered.index(name) + 1)
-            if not len(held):
+        for name, position, held in zip(action.names, action.positions[0],
+                                        annotated_grips(chain, numbered, action.names), strict=True):
+            if not held:
                 distances = np.linalg.norm(chain.points - position, axis=1)
-                held = np.array([distances.argmin()])
+                held = (int(distances.argmin()),)
                 if distances.min() > options.grip_tolerance:
                     raise InputError(
                         str(action), f'{name} closing {distances.min():.4g} m from any point of {latest}',
                         f'at most {options.grip_tolerance:g} m (grip_tolerance)',
                         'check the first waypoint, or number the gripped points in the field hand')
-            twice = {grip for other in grips for grip in other} & set(held.tolist())
+            twice = {grip for other in grips for grip in other} & set(held)
             if twice:
                 raise InputError(
                     str(action), f'two hands that grip point {min(twice)} of {latest}',
                     'different points', 'number the gripped points in the field hand, or leave one hand out')
-            grips.append(tuple(held.tolist()))
-        return Move(action, tuple(grips),
-                     tuple(action.stamp + round(float(t) * NANOSECONDS) for t in action.times))
+            grips.append(held)
+        return Move(action, tuple(grips), instants_of(action))
 
     def _view(self, goal: ChainMessage, options: Options) -> GoalView:
         start = self.starts[-1]
@@ -199,11 +196,11 @@ class TrialBuilder:
         if velocity is None:
             zero = min([self.views[0].message.stamp, *(move.instants[0] for move in self.moves)])
         actions = tuple(
-            Action(tuple(Hand(hand, move.grips[k], _seconds(move.instants, zero),
+            Action(tuple(Hand(hand, move.grips[k], seconds(move.instants, zero),
                               move.message.positions[:, k], move.message.orientations[:, k])
                          for k, hand in enumerate(move.message.names)))
             for move in self.moves)
-        goals = tuple(Goal(one.message.chain, float(_seconds([one.message.stamp], zero)[0]), one.stable,
+        goals = tuple(Goal(one.message.chain, float(seconds([one.message.stamp], zero)[0]), one.stable,
                            one.held_by) for one in self.views)
         return Trial(name, start.chain, actions, goals, velocity)
 
@@ -229,6 +226,22 @@ class TrialBuilder:
         return f'a goal_chain after {self.moves[0].message}{early}'
 
 
-def _seconds(instants: Iterable[int], zero: int) -> Floats:
+def instants_of(action: ActionMessage) -> tuple[int, ...]:
+    """Return the instants of the waypoints [ns]."""
+    return tuple(action.stamp + round(float(t) * NANOSECONDS) for t in action.times)
+
+
+def annotated_grips(chain: Chain, numbered: Sequence[str], names: Sequence[str]) -> list[tuple[int, ...]]:
+    """
+    Return the points that hands grip by the annotation of a chain; empty where it does not tell.
+
+    :param numbered: names of the hands that the annotation numbers, in this order.
+    :param names: of the hands asked for.
+    """
+    return [() if chain.hands is None or name not in numbered else
+            tuple(np.flatnonzero(chain.hands == numbered.index(name) + 1).tolist()) for name in names]
+
+
+def seconds(instants: Iterable[int], zero: int) -> Floats:
     """Return [ns] instants as seconds since `zero`; equal instants give equal numbers."""
     return np.array([(instant - zero) / NANOSECONDS for instant in instants])

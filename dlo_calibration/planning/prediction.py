@@ -15,14 +15,16 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.model.action import Action
+from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.manipulation import PATHS, Together
 from dlo_calibration.model.named_actions import NamedAction
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
 from dlo_calibration.planning.rehearsal import in_turn, Job, PAUSE, Rehearsal, Rehearser, Step
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
 INTERVAL = (5.0, 95.0)  # %
+Doing = Union[NamedAction, Action, Step, Together]
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class PredictedStep:
     """
     An action, and the DLO at rest after it.
 
-    :param name: of the action: that of a named action, else `hand_paths`.
+    :param name: of the action: that of a named action, else `hand_paths`; see `Together`.
     :param step: the paths of the hands, in the time of the whole sequence.
     :param chain: (n, 3) [m] with the found parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
@@ -61,7 +63,7 @@ class Prediction:
 
 
 def simulate(found: CalibratedDlo, chain: Chain,
-             actions: Sequence[Union[NamedAction, Action, Step]], *, options: Options | None = None,
+             actions: Sequence[Doing], *, options: Options | None = None,
              draws: int = DRAWS, seed: int = 1, make_simulator: SimulatorFactory = make_chosen_simulator,
              should_stop: Callable[[], bool] = lambda: False) -> Prediction:
     """
@@ -72,7 +74,8 @@ def simulate(found: CalibratedDlo, chain: Chain,
 
     :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param chain: the DLO before the first action.
-    :param actions: at least one; an `Action` opens its hands at the end, a `Step` says which stay closed.
+    :param actions: at least one; an `Action` opens its hands at the end, a `Step` says which stay closed,
+        and `Together` combines actions that overlap in time.
     :param options: of the simulation; None: the defaults.
     :param draws: from the posterior, for the intervals; 0: the intervals contain the model error only.
     :raises InputError: if an action is impossible with the chain before it.
@@ -114,22 +117,40 @@ def intervals(best: Floats, drawn: Sequence[Floats], error: float) -> tuple[Floa
     return (best - np.sqrt(np.maximum(below, 0)**2 + left), best + np.sqrt(np.minimum(above, 0)**2 + left))
 
 
-def _steps(rehearse: Rehearser, chain: Chain, actions: Sequence[Union[NamedAction, Action, Step]],
+def _steps(rehearse: Rehearser, chain: Chain, actions: Sequence[Doing],
            physical: dict[str, float]) -> tuple[tuple[Step, ...], Rehearsal]:
     """Return the actions as steps in turn, and their rehearsal with the found parameters."""
     steps: list[Step] = []
     for action in actions:
         if isinstance(action, NamedAction):
-            before, earlier = chain, [step.action for step in in_turn(steps)]
-            if steps:
-                before = Chain(_rehearsed(rehearse, chain, steps, physical).chains[-1])
-                action = replace(action, start=earlier[-1].end + PAUSE)
-            paths = action.action(before, earlier)
             after = {hand for step in steps[-1:] for hand in step.held_by} - set(action.hand_names)
-            steps.append(Step(paths, (*sorted(after), *(action.hand_names if action.hold else ()))))
+            action = Together((action,), (*sorted(after), *(action.hand_names if action.hold else ())))
+        if isinstance(action, Together):
+            before = chain
+            if steps and any(isinstance(one, NamedAction) for one in action.actions):
+                before = Chain(_rehearsed(rehearse, chain, steps, physical).chains[-1])
+            steps.append(_combined(action, before, [step.action for step in in_turn(steps)]))
         else:
             steps.append(action if isinstance(action, Step) else Step(action))
     return in_turn(steps), _rehearsed(rehearse, chain, steps, physical)
+
+
+def _combined(together: Together, before: Chain, earlier: Sequence[Action]) -> Step:
+    """
+    Return one step for actions that overlap in time.
+
+    :param before: the DLO then.
+    :param earlier: the actions before, in turn.
+    """
+    first = min(one.start for one in together.actions)
+    begin = earlier[-1].end + PAUSE if earlier else 0.0
+    hands: list[Hand] = []
+    for one in together.actions:
+        start = begin + one.start - first
+        paths = replace(one, start=start).action(before, earlier) if isinstance(one, NamedAction) else \
+            Step(one).starting(start).action
+        hands += paths.hands
+    return Step(Action(tuple(hands)), together.held_by)
 
 
 def _rehearsed(rehearse: Rehearser, chain: Chain, steps: Sequence[Step],
@@ -140,5 +161,5 @@ def _rehearsed(rehearse: Rehearser, chain: Chain, steps: Sequence[Step],
     return found
 
 
-def _name(action: Union[NamedAction, Action, Step]) -> str:
-    return action.name if isinstance(action, NamedAction) else 'hand_paths'
+def _name(action: Doing) -> str:
+    return action.name if isinstance(action, (NamedAction, Together)) else PATHS
