@@ -93,6 +93,7 @@ setup(
     entry_points={
         'console_scripts': [
             f'calibrator = {NAME}.ros.calibrator:main',
+            f'planner = {NAME}.ros.planner:main',
             f'dlo-calibration = {NAME}.__main__:main',
         ],
     },

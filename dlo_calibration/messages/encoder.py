@@ -52,15 +52,23 @@ def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage
         found += [ChainMessage(INITIAL, zero - BEFORE, frame_id, earlier),
                   ChainMessage(INITIAL, zero, frame_id, initial)]
     for hands in groups:
-        times = np.unique(np.concatenate([hand.times for hand in hands]))
-        poses = [_poses(hand, times) for hand in hands]
-        found.append(ActionMessage(
-            at(times[0]), frame_id, tuple(hand.name for hand in hands), times - times[0],
-            np.stack([positions for positions, _ in poses], axis=1),
-            np.stack([turns for _, turns in poses], axis=1)))
+        found.append(action_message(hands, at(min(hand.start for hand in hands)), frame_id))
     for goal in trial.goals:
         found.append(ChainMessage(GOAL, at(goal.time), frame_id, _annotated_goal(trial, goal, groups)))
     return sorted(found, key=order)
+
+
+def action_message(hands: Sequence[Hand], stamp: int, frame_id: str) -> ActionMessage:
+    """
+    Return the message of hands that act together, with waypoints at the times of all of them.
+
+    :param stamp: when the first hand closes [ns].
+    """
+    times = np.unique(np.concatenate([hand.times for hand in hands]))
+    poses = [_poses(hand, times) for hand in hands]
+    return ActionMessage(stamp, frame_id, tuple(hand.name for hand in hands), times - times[0],
+                         np.stack([positions for positions, _ in poses], axis=1),
+                         np.stack([turns for _, turns in poses], axis=1))
 
 
 def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
@@ -145,7 +153,10 @@ def _poses(hand: Hand, times: Floats) -> tuple[Floats, Floats]:
     """Return (k, 3) positions [m] and (k, 4) quaternions of a hand at (k,) times [s]."""
     if len(hand.times) == len(times):
         return hand.positions, hand.orientations
+    if (hand.orientations == hand.orientations[0]).all():
+        return hand.positions_at(times), np.repeat(hand.orientations[:1], len(times), axis=0)
     from scipy.spatial.transform import Rotation, Slerp  # slow to load
 
     turns = Rotation.from_quat(hand.orientations)
-    return hand.positions_at(times), np.asarray(Slerp(hand.times, turns)(times).as_quat())
+    at = np.clip(times, hand.start, hand.end)  # a hand rests before and after its path
+    return hand.positions_at(times), np.asarray(Slerp(hand.times, turns)(at).as_quat())

@@ -43,7 +43,7 @@ def progress(types: MessageTypes, *, stamp: int, evaluation: Evaluation, best: E
     message = (f'evaluation {evaluation.index + 1} of {evaluations}, best score {number(best.score)}, '
                f'{number(seconds_left)} s left')
     level = WARN if evaluation.failure else OK
-    return _diagnostics(types, stamp, [_status(types, level, 'progress', message, values)])
+    return diagnostic_array(types, stamp, [diagnostic_status(types, level, 'progress', message, values)])
 
 
 def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
@@ -56,18 +56,18 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
         if not row['identifiable']:
             message += f'; {row["verdict"] or "not identifiable from these trials"}'
         scale = {key: row.pop(key) for key in ('value', 'std', 'lower', 'upper')}
-        statuses.append(_status(types, OK if row['identifiable'] else WARN, name, message,
-                                {**scale, 'unit': '0..100', **row}))
+        statuses.append(diagnostic_status(types, OK if row['identifiable'] else WARN, name, message,
+                                          {**scale, 'unit': '0..100', **row}))
     # These have a status or keys of their own, or are too long for a message.
     left_out = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
-    statuses.append(_status(
+    statuses.append(diagnostic_status(
         types, WARN if found.warnings else OK, WHOLE,
         f'score {number(found.best.score)}, mean error {measured(found.errors.mean, "m")}; '
         f'{found.stop_reason}',
         {**_pairs({key: told[key] for key in told if key not in left_out}),
          'findings': ' '.join(sentences.sentences(found)),
          **_pairs(told['confirmation'] or {}, 'confirmation_')}))
-    return _diagnostics(types, stamp, statuses)
+    return diagnostic_array(types, stamp, statuses)
 
 
 def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
@@ -102,19 +102,22 @@ def status(types: MessageTypes, *, stamp: int, state: str, trials: int, last_ref
     last_trial = '' if information is None else information.words
     if last_trial and state == 'collecting':
         message += f'; {last_trial}'
-    return _diagnostics(types, stamp, [_status(
+    return diagnostic_array(types, stamp, [diagnostic_status(
         types, ERROR if state == 'failed' else OK, 'status', message,
         {'state': state, 'trials': trials, 'last_refusal': last_refusal, 'incomplete': incomplete,
          'detail': detail, 'dropped': dropped, 'last_trial': last_trial,
          **({} if information is None else information.values)})])
 
 
-def _diagnostics(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:
+def diagnostic_array(types: MessageTypes, stamp: int, statuses: Sequence[Any]) -> Any:
+    """Build a message with statuses; `stamp` in ns."""
     return types.build('diagnostic_msgs/msg/DiagnosticArray', header=types.header(stamp),
                        status=list(statuses))
 
 
-def _status(types: MessageTypes, level: int, name: str, message: str, values: Mapping[str, Any]) -> Any:
+def diagnostic_status(types: MessageTypes, level: int, name: str, message: str,
+                      values: Mapping[str, Any]) -> Any:
+    """Build a status: a level, a text for people, and values from which programs read them back exactly."""
     pairs = [types.build('diagnostic_msgs/msg/KeyValue', key=key, value=printable(exact(value)))
              for key, value in values.items()]
     return types.build('diagnostic_msgs/msg/DiagnosticStatus', level=types.level(level), name=name,

@@ -5,15 +5,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.declaration import DeclaredOptions
+from dlo_calibration.errors import DEFECT, InputError
+
+Chosen_co = TypeVar('Chosen_co', bound=DeclaredOptions, covariant=True)
 
 
-class Graph(Protocol):
-    """What a session needs from its node."""
+class Graph(Protocol[Chosen_co]):
+    """What a session needs from its node, whose options are of some class."""
 
-    def options(self) -> Options:
+    def options(self) -> Chosen_co:
         """Return the options in force."""
 
     def stamp(self) -> int:
@@ -42,3 +45,21 @@ class Graph(Protocol):
 
     def error(self, text: str) -> None:
         """Log an error."""
+
+
+def decoded(graph: Graph[Any], kind: str, type_name: str, octets: bytes) -> Any:
+    """
+    Return the message that came on an input topic.
+
+    :raises InputError: if its bytes are damaged.
+    """
+    try:
+        return graph.decode(kind, octets)
+    except Exception as error:  # whatever the decoder meets in damaged bytes
+        raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {type_name}',
+                         'check what publishes it') from error
+
+
+def why(error: Exception, kind: str) -> str:
+    """Return why a message of a kind is refused."""
+    return str(error) if isinstance(error, InputError) else f'{kind}: could not be used ({error!r}); {DEFECT}'

@@ -45,14 +45,19 @@ def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_i
     :param result: its rollouts are shown with those of `trials` that it was calibrated on.
     """
     header = types.header(stamp, frame_id)
-    built = [_Brush(types, header, '', 1.0).marker('', 0, SPHERE, action=DELETE_ALL)]
+    built = [cleared(types, header)]
     simulated = {} if result is None else {
         trial.name: (trial, chains) for trial, chains in zip(result.trials, result.chains, strict=True)}
     for k, trial in enumerate(trials):
         of_result, chains = simulated.get(trial.name, (trial, None))
-        brush = _Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length)
+        brush = Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length)
         built += _trial_markers(brush, trial, chains if _same(trial, of_result) else None, k)
     return types.build(OUTPUT_TYPES['markers'], markers=built)
+
+
+def cleared(types: MessageTypes, header: Any) -> Any:
+    """Build the marker that removes all others: the first one of each message."""
+    return Brush(types, header, '', 1.0).marker('', 0, SPHERE, action=DELETE_ALL)
 
 
 def error_colour(share: float) -> Colour:
@@ -72,7 +77,7 @@ def _same(trial: Trial, other: Trial) -> bool:
         for one, two in zip(trial.goals, other.goals, strict=True))
 
 
-def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
+def _trial_markers(brush: Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
     yield brush.line('initial', 0, trial.initial.points, INITIAL_COLOUR)
     for goal in shown_goals(len(trial.goals)):
         points = trial.goals[goal].chain.points
@@ -82,7 +87,7 @@ def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -
             yield brush.line('simulated', goal, chains[goal], SIMULATED_COLOUR)
             yield from _error_markers(brush, goal, points, chains[goal], trial.initial.length)
     for place, hand in enumerate(trial.hands[:MOST_HANDS]):
-        yield from _hand_markers(brush, 3 * place, hand, HAND_COLOURS[place % len(HAND_COLOURS)], trial)
+        yield from hand_markers(brush, 3 * place, hand, trial.initial.points)
     text = trial.name
     if chains is not None:
         errors = PointErrors.of(residuals(trial, chains))
@@ -92,7 +97,7 @@ def _trial_markers(brush: _Brush, trial: Trial, chains: Floats | None, k: int) -
     yield brush.label('label', 0, trial.initial.points[0] + above, text)
 
 
-def _error_markers(brush: _Brush, goal: int, points: Floats, simulated: Floats,
+def _error_markers(brush: Brush, goal: int, points: Floats, simulated: Floats,
                    length: float) -> Iterator[Any]:
     """Show each point's error: a sphere at the simulated point, and a line to the measured one."""
     colours = [error_colour(float(error) / length)
@@ -103,18 +108,23 @@ def _error_markers(brush: _Brush, goal: int, points: Floats, simulated: Floats,
                        colours=[colour for colour in colours for _ in range(2)])
 
 
-def _hand_markers(brush: _Brush, first: int, hand: Hand, colour: Colour, trial: Trial) -> Iterator[Any]:
-    """Show a hand's path, the points that it grips, and the place where it opens."""
-    path = hand_path(hand)
+def hand_markers(brush: Brush, first: int, hand: Hand, points: Floats) -> Iterator[Any]:
+    """
+    Show a hand's path, the points that it grips, and the place where it opens.
+
+    :param first: number of the first of three markers of a hand: 0, 3, 6...; it chooses the colour.
+    :param points: (n, 3) [m] of the DLO when the hand closes.
+    """
+    path, colour = hand_path(hand), HAND_COLOURS[first // 3 % len(HAND_COLOURS)]
     if np.ptp(path, axis=0).max() > 0:
         yield brush.line('hands', first, path, colour, 0.5)
-    yield brush.spheres('hands', first + 1, trial.initial.points[list(hand.grips)], [colour], 2.2)
+    yield brush.spheres('hands', first + 1, points[list(hand.grips)], [colour], 2.2)
     yield brush.marker('hands', first + 2, CUBE, at=path[-1], colours=[colour], scale=2.0)
 
 
-class _Brush:
+class Brush:
     """
-    Draws the markers of one trial.
+    Draws the markers of one trial or plan.
 
     :param prefix: first part of all namespaces, e.g. ``trial_1``.
     :param thickness: of a line [m]; the `scale` of a marker is a multiple of it.

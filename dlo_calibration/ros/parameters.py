@@ -49,8 +49,13 @@ class OptionsNode(Node, Generic[Chosen]):
         """Return the options in force."""
         return self._kind.of({name: _plain(self.get_parameter(name).value) for name in self._declared})
 
-    def changed(self, names: Sequence[str]) -> None:
-        """Do nothing; a subclass may override it to learn which parameters have new values."""
+    def changed(self, names: Sequence[str], options: Chosen) -> None:
+        """
+        Do nothing; a subclass may override it to learn which parameters get new values.
+
+        :param options: with the new values.
+        :raises InputError: if the subclass refuses them.
+        """
 
     def refuse(self, text: str) -> None:
         """Log why something was refused; a subclass may report it elsewhere, too."""
@@ -82,11 +87,11 @@ class OptionsNode(Node, Generic[Chosen]):
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         new = {p.name: _plain(p.value) for p in parameters if p.name in self._declared}
         try:
-            self._checked({**self.options().flat(), **new})
+            options = self._checked({**self.options().flat(), **new})
+            if new:
+                self.changed(list(new), options)
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        if new:
-            self.changed(list(new))
         return SetParametersResult(successful=True)
 
     def _checked(self, flat: Mapping[str, Any]) -> Chosen:

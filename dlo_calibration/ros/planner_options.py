@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dlo_calibration.calibration.declaration import declared, MACHINE
+from dlo_calibration.errors import InputError
 from dlo_calibration.planning.options import PlanOptions
 
 PLAN, PUBLISH = 'plan', 'publish'  # modes
@@ -18,8 +19,18 @@ class PlannerOptions(PlanOptions):
     """Everything that a user of the node can set; `description` and `mode` are its own."""
 
     description: str = declared(
-        '', 'path of the result.xml of the DLO, relative to the working directory; empty: the document that '
-        'comes on ~/dlo_description', of=MACHINE)
+        '', 'path of the result.xml of the DLO, relative to the working directory, which the node then '
+        'publishes on ~/dlo_description; empty: the document that comes there', of=MACHINE)
     mode: str = declared(
         PLAN, 'plan: make plans; publish: only serve the description on ~/dlo_description, latched, as '
         'robot_description is served', choices=(PLAN, PUBLISH), of=MACHINE)
+
+    def check_together(self) -> None:
+        """
+        Check options that depend on one another.
+
+        :raises InputError: if there is nothing to publish.
+        """
+        if self.mode == PUBLISH and not self.description:
+            raise InputError('parameter description', 'an empty text', 'a path, in the mode publish',
+                             'name the result.xml to publish')

@@ -16,6 +16,7 @@ from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import LiveInformation
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
@@ -29,7 +30,7 @@ from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.ros.graph import Graph
+from dlo_calibration.ros.graph import decoded, Graph, why
 from dlo_calibration.ros.markers import markers
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.ros.situation import Calibration, Pace, Situation
@@ -51,7 +52,7 @@ class CalibrationSession:
     :param clock: a monotonic clock [s].
     """
 
-    def __init__(self, graph: Graph, types: MessageTypes, make_simulator: SimulatorFactory,
+    def __init__(self, graph: Graph[Options], types: MessageTypes, make_simulator: SimulatorFactory,
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
         self._make_simulator = make_simulator
@@ -166,14 +167,9 @@ class CalibrationSession:
     def _read(self, kind: str, octets: bytes) -> tuple[Message | None, str]:
         """Return a message, or None and why it cannot be read."""
         try:
-            try:
-                message = self._graph.decode(kind, octets)
-            except Exception as error:  # whatever the decoder meets in damaged bytes
-                raise InputError(kind, f'bytes that do not decode ({error!r})', f'a {INPUT_TYPES[kind]}',
-                                 'check what publishes it') from error
-            return read(kind, message), ''
+            return read(kind, decoded(self._graph, kind, INPUT_TYPES[kind], octets)), ''
         except Exception as error:  # a defect of this package must not end the session
-            return None, _why(error, kind)
+            return None, why(error, kind)
 
     def _collect(self, message: Message) -> str:
         """Collect a message; return why it is refused, if it is."""
@@ -184,7 +180,7 @@ class CalibrationSession:
             for refusal in self._collector.take_news():
                 self.refuse(str(refusal))
         except Exception as error:
-            return _why(error, message.kind)
+            return why(error, message.kind)
         return ''
 
     def clock_went_back(self, before: int, now: int) -> None:
@@ -393,8 +389,3 @@ class CalibrationSession:
         self._situation.last_refusal = text
         self._graph.error(text)
         self._report()
-
-
-def _why(error: Exception, kind: str) -> str:
-    """Return why a message of a kind is refused."""
-    return str(error) if isinstance(error, InputError) else f'{kind}: could not be used ({error!r}); {DEFECT}'

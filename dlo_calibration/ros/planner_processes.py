@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""PlannerProcesses: processes that simulate, kept from one plan to the next."""
+
+from __future__ import annotations
+
+from contextlib import closing
+import threading
+from typing import Callable
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.evaluation.processes import cores, ProcessExecutor
+
+
+class PlannerProcesses:
+    """
+    Keeps processes ready, so that the first simulation of a plan does not wait for the compiler.
+
+    :param make_simulator: makes the engine, in each process and in this one; it is sent to the processes.
+    :param on_death: called with a sentence for each process that dies, from any thread.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory, on_death: Callable[[str], None]) -> None:
+        self._make_simulator = make_simulator
+        self._on_death = on_death
+        self._changing = threading.Lock()
+        self._executor: ProcessExecutor | None = None
+        self._kept: tuple[int, float] | None = None  # number and limit that the processes have
+        self._engine: str | None = None  # what they have loaded
+        self._closed = False
+
+    def prepare(self, simulation: Options, workers: int) -> None:
+        """Begin to start processes and to load the engine in them; return at once."""
+        threading.Thread(target=self._try, args=(simulation, workers), name='preparing', daemon=True).start()
+
+    def ready(self, simulation: Options, workers: int) -> ProcessExecutor:
+        """
+        Return the executor when its processes can simulate.
+
+        :param workers: number of processes; 0: one per core.
+        :raises DloCalibrationError: if no process can be started, or the engine cannot be used.
+        """
+        with self._changing:
+            executor = self._started(workers or cores(), simulation.answer_limit)
+            engine = f'{simulation.engine} {simulation.scene}'
+            if self._engine != engine:
+                # One alone compiles the kernels, if they are not in Numba's cache; the others load them.
+                executor.submit(_load, self._make_simulator, simulation).result()
+                for _ in range((workers or cores()) - 1):
+                    executor.submit(_load, self._make_simulator, simulation)
+                _load(self._make_simulator, simulation)
+                self._engine = engine
+            return executor
+
+    def close(self) -> None:
+        """End the processes now; what they simulate is cancelled."""
+        self._closed = True
+        if self._executor is not None:
+            self._executor.close()
+
+    def _try(self, simulation: Options, workers: int) -> None:
+        try:
+            self.ready(simulation, workers)
+        except Exception:  # the next plan meets the same error, and tells it
+            pass
+
+    def _started(self, workers: int, answer_limit: float) -> ProcessExecutor:
+        """Return an executor of so many processes: the present one, or a new one instead of it."""
+        if self._executor is None or self._kept != (workers, answer_limit):
+            if self._executor is not None:
+                self._executor.close()
+            self._engine = None
+            self._executor = ProcessExecutor(workers, self._on_death, answer_limit)
+            self._kept = workers, answer_limit
+            if self._closed:
+                self._executor.close()
+        return self._executor
+
+
+def _load(make_simulator: SimulatorFactory, simulation: Options) -> None:
+    """Load all that simulations need."""
+    with closing(make_simulator(simulation)) as simulator:
+        simulator.prepare()
