@@ -21,7 +21,7 @@ def plan_sentences(plan: Plan) -> list[str]:
     steps = [f'{k}. {one.name}: {"; ".join(_hand(plan, hand) for hand in one.action.hands)}; then the points '
              f'are {distance(plan, one.predicted)} from the goal on average.'
              for k, one in enumerate(plan.actions, start=1)]
-    return [*steps, _reached(plan), *plan.remarks]
+    return [*steps, outcome(plan), *plan.remarks]
 
 
 def distance(plan: Plan, points: Floats) -> str:
@@ -43,7 +43,8 @@ def _hand(plan: Plan, hand: Hand) -> str:
             f'({x:.3f}, {y:.3f}) m and opens')
 
 
-def _reached(plan: Plan) -> str:
+def outcome(plan: Plan) -> str:
+    """Say whether the goal is reached, with how many actions, and how near it gets."""
     tolerance = f'the tolerance of {_of_length(plan, plan.tolerance)}'
     if not plan.actions and plan.reached:
         return f'The DLO is at the goal already: {_of_length(plan, plan.error_before)}, within {tolerance}.'

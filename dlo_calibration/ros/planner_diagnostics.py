@@ -52,15 +52,3 @@ def planner_status(types: MessageTypes, *, stamp: int, state: str, detail: str, 
             'remarks': ' '.join(plan.remarks)})
     message = f'{state}: {detail}' if detail else state
     return diagnostic_array(types, stamp, [diagnostic_status(types, level, 'status', message, values)])
-
-
-def plan_words(plan: Plan) -> str:
-    """Return a sentence on a plan, for people."""
-    after = f'{measured(plan.error_after, "m")} ({number(100 * plan.error_after / plan.start.length)} % of ' \
-        'the length)'
-    if not plan.actions:
-        return f'the DLO is at the goal, mean error {after}' if plan.reached else \
-            f'no action was found that brings the DLO nearer, mean error {after}; {plan.stop_reason}'
-    within = 'within' if plan.reached else 'not within'
-    return (f'{len(plan.actions)} action(s) bring the mean error from {measured(plan.error_before, "m")} to '
-            f'{after}, {within} the tolerance of {measured(plan.tolerance, "m")}; {plan.stop_reason}')

@@ -26,13 +26,13 @@ from dlo_calibration.planning.plain import plain_plan
 from dlo_calibration.planning.plan import Plan
 from dlo_calibration.planning.planner import plan as find_plan
 from dlo_calibration.planning.planner import PlanProgress
+from dlo_calibration.report.plan_sentences import outcome
 from dlo_calibration.ros.graph import decoded, Graph, why
 from dlo_calibration.ros.newest import Newest
 from dlo_calibration.ros.planner_diagnostics import (
     DONE,
     FAILED,
     plan_progress,
-    plan_words,
     planner_status,
     PLANNING,
     WAITING,
@@ -286,7 +286,8 @@ class PlannerSession:
             # With use_sim_time and no /clock, the node's time is 0, which is no stamp of an action.
             message = action_message(plan.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)
             self._send(ACTION, action_trajectory(self._types, message))
-        self._state, self._detail, self._plan = DONE, plan_words(plan), plan
+        self._state, self._plan = DONE, plan
+        self._detail = outcome(plan) if plan.reached else f'{outcome(plan)} The search: {plan.stop_reason}.'
         self._graph.info(f'plan {self._plans}: {self._detail}')
         for remark in plan.remarks:
             self._graph.warn(remark)
