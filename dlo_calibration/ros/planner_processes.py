@@ -1,24 +1,30 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""PlannerProcesses: processes that simulate, kept from one plan to the next."""
+"""
+PlannerProcesses: processes that simulate, kept from one plan to the next.
+
+This process never loads an engine: loading one, or compiling its kernels, would delay answers to requests.
+"""
 
 from __future__ import annotations
 
 from contextlib import closing
 import threading
-from typing import Callable
+from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 
 class PlannerProcesses:
     """
     Keeps processes ready, so that the first simulation of a plan does not wait for the compiler.
 
-    :param make_simulator: makes the engine, in each process and in this one; it is sent to the processes.
+    :param make_simulator: makes the engine; it is sent to the processes.
     :param on_death: called with a sentence for each process that dies, from any thread.
     """
 
@@ -50,7 +56,6 @@ class PlannerProcesses:
                 executor.submit(_load, self._make_simulator, simulation).result()
                 for _ in range((workers or cores()) - 1):
                     executor.submit(_load, self._make_simulator, simulation)
-                _load(self._make_simulator, simulation)
                 self._engine = engine
             return executor
 
@@ -77,6 +82,45 @@ class PlannerProcesses:
             if self._closed:
                 self._executor.close()
         return self._executor
+
+
+class MadeWhereUsed:
+    """
+    A simulator whose engine is made by the first process that simulates with a copy of it.
+
+    :param make_simulator: makes the engine with the options.
+    """
+
+    name = 'made where it is used'
+
+    def __init__(self, make_simulator: SimulatorFactory, options: Options) -> None:
+        self._make_simulator, self._options = make_simulator, options
+        self._simulator: Simulator | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, '_simulator': None}
+
+    def prepare(self) -> None:
+        """Do nothing: the processes prepare themselves."""
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """Simulate a trial with the engine."""
+        return self._made().simulate(trial, physical)
+
+    def refined(self) -> Simulator | None:
+        """Return the finer engine."""
+        return self._made().refined()
+
+    def close(self) -> None:
+        """Close the engine."""
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
+
+    def _made(self) -> Simulator:
+        if self._simulator is None:
+            self._simulator = self._make_simulator(self._options)
+        return self._simulator
 
 
 def _load(make_simulator: SimulatorFactory, simulation: Options) -> None:

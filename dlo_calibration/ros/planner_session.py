@@ -10,6 +10,7 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from typing import Any, Callable, Mapping, Protocol, Union
@@ -39,7 +40,7 @@ from dlo_calibration.ros.planner_diagnostics import (
 )
 from dlo_calibration.ros.planner_markers import plan_markers
 from dlo_calibration.ros.planner_options import PlannerOptions
-from dlo_calibration.ros.planner_processes import PlannerProcesses
+from dlo_calibration.ros.planner_processes import MadeWhereUsed, PlannerProcesses
 
 CHAIN, GOAL, DESCRIPTION = 'chain', 'goal_chain', 'dlo_description'
 ACTION, STEPS = 'action', 'steps'
@@ -101,7 +102,8 @@ class PlannerSession:
                  plan: PlanFunction = find_plan, processes: Processes | None = None,
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
-        self._make_simulator, self._find = make_simulator, plan
+        self._find = plan
+        self._make_simulator = functools.partial(MadeWhereUsed, make_simulator)
         self._background: Background[Event] = Background('plan')
         self._processes: Processes = processes or PlannerProcesses(
             make_simulator, lambda text: self._background.events.put(Notice(text)))
