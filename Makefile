@@ -35,7 +35,8 @@ help:
 	@cat <<-END
 	  make demo    calibrate a sample session with the real node, and draw the result
 	  make test    run all tests
-	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables
+	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables;
+	               then execute plans with fitted, default and true parameters: what calibration is worth
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
 	  make soak    try hostile input and faults for up to an hour, and print what was lost and what died
@@ -48,6 +49,7 @@ demo: $(STAMP)
 
 experiment: $(STAMP)
 	@$(PYTHON) -m dlo_calibration experiment
+	$(PYTHON) benchmark/worth.py
 
 # One process more than there are cores, as some tests wait; four are enough.
 test: $(STAMP)
@@ -73,6 +75,9 @@ figures: bench
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
 	cp build/experiment/experiment.md benchmark/results/experiment.md
+	$(PYTHON) benchmark/worth.py --output build/experiment >/dev/null
+	cp build/experiment/worth.md benchmark/results/worth.md
+	cp build/experiment/worth.png doc/worth.png
 	for name in from_photographs $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
 
 clean:

@@ -19,6 +19,8 @@ import shlex
 import sys
 
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.cli.output import tell
+from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.experiment.known_dlos import KNOWN_DLOS
 from dlo_calibration.experiment.study import Observed
 from dlo_calibration.experiment.worth_conduct import conduct_worth, WorthStudy
@@ -51,12 +53,14 @@ def main() -> int:
     study = WorthStudy(observed, chosen.pairs, chosen.seed, PlanOptions(workers=1), chosen.workers,
                        shlex.join(command))
     with StopFlag() as stop:
-        text, attempts = conduct_worth(study, chosen.output, make_simulator, stop,
-                                       lambda line: print(line, file=sys.stderr, flush=True), sys.stderr)
+        text, attempts = conduct_worth(study, chosen.output, make_simulator, stop, tell, sys.stderr)
     print(text)
     attempts.require()
-    return stop.exit_code if '**Not complete**' in text or not text else 0
+    return stop.exit_code if stop() else 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except DloCalibrationError as error:
+        sys.exit(f'{sys.argv[0]}: {error}')

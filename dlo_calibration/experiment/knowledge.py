@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
 from contextlib import closing
 from dataclasses import dataclass
 import functools
@@ -101,10 +102,13 @@ def learn(task: Calibration, make_simulator: SimulatorFactory,
     Calibrate once in this process.
 
     :raises SimulationError: if no evaluation could be simulated.
+    :raises CancelledError: if stopped.
     """
     options = task.observed.options
     with closing(make_simulator(options)) as simulator:
         found = fitted(Setting(task.observed.trials, options, simulator, should_stop=should_stop))
+    if should_stop():
+        raise CancelledError
     return Knowledge(
         FITTED, found.space.mass, found.length,
         {name: (one.value, one.lower, one.upper) for name, one in found.parameters.items()},

@@ -13,6 +13,7 @@ from typing import Callable, Mapping, TextIO
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.experiment import worth_tables
 from dlo_calibration.experiment.journal import Journal
 from dlo_calibration.experiment.knowledge import Calibration, DEFAULT, Knowledge, learn, TRUE
@@ -44,6 +45,10 @@ class WorthStudy:
     options: PlanOptions
     workers: int
     command: str
+
+    def __post_init__(self) -> None:
+        if self.pairs < 1:
+            raise InputError('--pairs', str(self.pairs), '1 or more', 'correct it')
 
 
 def conduct_worth(study: WorthStudy, folder: Path, make_simulator: SimulatorFactory,

@@ -9,7 +9,7 @@ import csv
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -32,6 +32,8 @@ Done = Sequence[tuple[PlanTask, PlanOutcome]]
 
 KINDS = (FITTED, DEFAULT, TRUE)
 COLOURS = {FITTED: BLUE, DEFAULT: YELLOW, TRUE: GREEN}
+STYLES = {FITTED: '-', DEFAULT: '-', TRUE: (0, (4, 2))}  # dashed, as true and fitted often coincide
+TICKS = (0.1, 0.3, 1, 3, 10, 30)  # %
 WAYS = {OPEN_LOOP: 'open loop', REPLANNED: 'replanned'}
 NEAR = 3.0  # % of the length
 ALL = 'all'
@@ -169,10 +171,10 @@ def picture(done: Done, path: Path) -> None:
                 for kind in KINDS:
                     errors = np.sort([course.errors[-1] for course in courses(done, way, subject, kind)])
                     shares = 100 * np.arange(1, len(errors) + 1) / max(len(errors), 1)
-                    one.step([0.1, *errors, 100], [0, *shares, 100], where='post', color=COLOURS[kind],
-                             label=f'{kind} parameters', linewidth=1.6)
-                one.set(xscale='log', xlim=(0.2, 40), ylim=(0, 102), xticks=[0.3, 1, 3, 10, 30])
-                one.xaxis.set_major_formatter(_plain)
+                    one.step([TICKS[0] / 100, *errors, 100], [0, *shares, 100], where='post', linewidth=1.8,
+                             label=f'{kind} parameters', color=COLOURS[kind], linestyle=STYLES[kind])
+                one.set(xscale='log', xlim=(0.1, 40), ylim=(0, 102))
+                one.set_xticks(TICKS, [f'{tick:g}' for tick in TICKS])
                 one.minorticks_off()
         for one, subject in zip(axes[0], subjects, strict=True):
             one.set_title(as_text(subject))
@@ -181,6 +183,3 @@ def picture(done: Done, path: Path) -> None:
         handles, labels = axes[0][0].get_legend_handles_labels()
         legend_outside(figure, 'upper center', handles=handles, labels=labels, ncols=len(KINDS))
         write_figure(figure, path)
-
-
-_plain: Callable[[float, int], str] = lambda value, _: f'{value:g}'  # noqa: E731

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Random starts and goals, and the reality in which plans are executed."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from dlo_calibration import Action, Chain, Hand
+from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.experiment.known_dlos import KNOWN_DLOS
+from dlo_calibration.experiment.pairs import clear_of_itself, laid, random_pairs, seen, share_apart
+from dlo_calibration.experiment.reality import Reality
+
+ROPE, HOSE = KNOWN_DLOS[0], KNOWN_DLOS[4]
+
+
+@pytest.fixture(scope='module')
+def simulator():
+    with closing(make_simulator(Options()).refined()) as made:
+        yield made
+
+
+@pytest.fixture(scope='module')
+def pairs(simulator):
+    return {dlo: random_pairs(dlo, 2, 5, simulator) for dlo in (ROPE, HOSE)}
+
+
+@pytest.mark.parametrize('dlo', [ROPE, HOSE])
+def test_start_and_goal_are_shapes_at_rest_that_lie_apart(dlo, pairs, simulator):
+    for pair in pairs[dlo]:
+        assert 0.15 <= share_apart(dlo, pair.start.points, pair.goal.points) <= 0.3001
+        for chain in (pair.start, pair.goal):
+            assert np.abs(laid(dlo, chain.points, simulator) - chain.points).max() < 1e-3
+            assert chain.length == pytest.approx(dlo.length, rel=0.01)
+            assert clear_of_itself(dlo, chain.points)
+            assert seen(chain.points).shape == (21, 3)
+
+
+def test_a_pair_depends_on_the_seed_and_its_index_alone(pairs, simulator):
+    fewer, = random_pairs(ROPE, 1, 5, simulator)
+    other, = random_pairs(ROPE, 1, 6, simulator)
+    np.testing.assert_array_equal(fewer.goal.points, pairs[ROPE][0].goal.points)
+    assert not np.allclose(other.goal.points, fewer.goal.points, atol=0.01)
+
+
+def test_a_dlo_that_crosses_or_nearly_touches_itself_is_told():
+    angle = np.linspace(0, 2.2 * np.pi, 81)
+    circle = 0.6 / 2.2 / np.pi * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    assert clear_of_itself(ROPE, circle[:70])
+    assert not clear_of_itself(ROPE, circle)
+
+
+def straight():
+    points = np.zeros((81, 3))
+    points[:, 0], points[:, 2] = np.linspace(0, ROPE.length, 81), ROPE.radius
+    return Chain(points)
+
+
+def drag(place, by):
+    place = np.array([*place, ROPE.radius])
+    return Action((Hand('hand_1', (0,), np.array([0.0, 1.0]), place + np.array([[0, 0, 0], [*by, 0]])),))
+
+
+def test_a_hand_grips_what_is_nearest_to_where_it_closes(simulator):
+    reality = Reality(ROPE, straight(), simulator)
+    assert reality.act(drag((0.3, 0.01), (0, 0.1)))  # it was to grip point 0, which is elsewhere
+    assert np.abs(reality.points[40, :2] - (0.3, 0.1)).max() < 0.02
+    assert np.linalg.norm(reality.points[0] - straight().points[0]) < 0.03
+
+
+def test_a_hand_that_closes_on_nothing_does_nothing(simulator):
+    reality = Reality(ROPE, straight(), simulator)
+    assert not reality.act(drag((0.3, 0.03), (0, 0.1)))
+    np.testing.assert_array_equal(reality.points, straight().points)
+
+
+def test_the_next_action_finds_the_dlo_where_the_last_one_left_it(simulator):
+    reality = Reality(ROPE, straight(), simulator)
+    assert reality.act(drag((0.3, 0), (0, 0.1)))
+    before = reality.points
+    assert not reality.act(drag((0.3, 0), (0, 0.1)))
+    assert reality.act(drag(before[40, :2], (0, -0.05)))
+    assert reality.points[40, 1] == pytest.approx(before[40, 1] - 0.05, abs=0.01)
+    assert len(reality.points) == 81
