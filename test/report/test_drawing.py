@@ -179,6 +179,7 @@ def test_long_trial_has_no_more_frames_than_a_viewer_can_bear():
 
 
 def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr('dlo_calibration.simulation.motion.FRAME_RATE', 3)
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 3)
     monkeypatch.setattr('dlo_calibration.report.animation.DOTS_PER_INCH', 40)
     trial, = toy_trials(1)
