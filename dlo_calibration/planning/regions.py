@@ -66,11 +66,11 @@ class Box:
         :param begin: (m, 3) [m]; `end` (m, 3) [m] may be the same place.
         :returns: (m,)
         """
-        step = end - begin
+        step, lower, upper = end - begin, self.lower - ROUNDING, self.upper + ROUNDING
         with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-            one, other = (self.lower - begin) / step, (self.upper - begin) / step
+            one, other = (lower - begin) / step, (upper - begin) / step
         along = step == 0  # parallel to the slab: either always inside, or never
-        within = (begin >= self.lower) & (begin <= self.upper)
+        within = (begin >= lower) & (begin <= upper)
         enter = np.where(along, np.where(within, -np.inf, np.inf), np.minimum(one, other)).max(axis=1)
         leave = np.where(along, np.where(within, np.inf, -np.inf), np.maximum(one, other)).min(axis=1)
         entered: NDArray[np.bool_] = np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)
