@@ -24,7 +24,7 @@ from dlo_calibration.simulation.protocol import advanced, Simulator
 
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
 REST = 0.01  # s from the end of an action to the instant from which on the DLO comes to rest
-COURSE_STEP = 0.1  # s between two chains of the course of an action
+COURSE_STEP = 0.01  # m that a hand moves, at most, between two chains of the course of an action
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Rehearsal:
 
     :param chains: (k, n, 3) [m] the DLO at rest after each of the k actions.
     :param settled: (k,) False where it did not come to rest within the time limit.
-    :param courses: for each action, (m, n, 3) [m] the DLO while the hands move, every COURSE_STEP; empty
+    :param courses: for each action, (m, n, 3) [m] the DLO while the hands move, at every COURSE_STEP; empty
         where they were not asked for.
     :param failure: why it could not be simulated, in words; empty if it could.  `chains` is nan then.
     """
@@ -92,11 +92,20 @@ def rehearsed_trial(start: Chain, steps: Sequence[Step], courses: bool = False) 
     for step in steps:
         action = step.action
         if courses:
-            times = np.arange(action.start, action.end, COURSE_STEP)[1:]
+            times = _on_the_way(action)
             names = tuple(hand.name for hand in action.hands)
             goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
         goals.append(Goal(start, action.end + REST, held_by=step.held_by))
     return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals))
+
+
+def _on_the_way(action: Action) -> Floats:
+    """Return instants [s] between start and end of an action; no hand moves further than COURSE_STEP."""
+    speeds = [np.linalg.norm(np.diff(hand.positions, axis=0), axis=1) / np.diff(hand.times)
+              for hand in action.hands]
+    fastest = np.concatenate(speeds).max(initial=0.0)
+    pieces = int(np.ceil((action.end - action.start) * fastest / COURSE_STEP))
+    return np.linspace(action.start, action.end, pieces + 1)[1:-1]
 
 
 def rehearse(simulator: Simulator, job: Job) -> Rehearsal:

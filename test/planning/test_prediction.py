@@ -94,6 +94,17 @@ def test_rehearsals_do_not_depend_on_the_executor():
     assert alone.count == together.count == 8
 
 
+@pytest.mark.parametrize('speed', [0.1, 1.0])
+def test_a_course_misses_nothing_however_fast_the_hand_is(speed):
+    step = Step(GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.1, speed=speed).action(straight()))
+    found, = Rehearser(make_simulator(Options()))(
+        [Job(straight(), (step,), Posterior.of(MadeUpDlo()).best, courses=True)])
+    course, = found.courses
+    assert np.linalg.norm(np.diff(course[:, 0], axis=0), axis=1).max() < 0.0101
+    assert course[:, 0, 2].max() > 0.05
+    np.testing.assert_allclose(course[-1, 0], step.action.hands[0].positions[-1], atol=0.0101)
+
+
 def test_a_rehearsal_that_diverges_says_so():
     step = Step(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     physical = Posterior.of(MadeUpDlo()).best
