@@ -64,7 +64,7 @@ def write_plan_picture(plan: Plan, path: str | Path) -> None:
                 _draw_action(view, plan.actions[k], colours)
                 axes.set_title(as_text(f'{k + 1}. {plan.actions[k].name}: then '
                                        f'{distance(plan, plan.actions[k].predicted)} from the goal'),
-                               fontsize=11)
+                               fontsize=10)
             _draw_goal(view)
             view.draw_first_point()
             axes.update_datalim(view.flat(everything).T)  # the same section of the table in all panels
