@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the launch file starts, and what RViz and Foxglove are set up to show, exists."""
+"""What the launch files start, and what RViz and Foxglove are set up to show, exists."""
 
 import importlib.util
 import json
@@ -12,6 +12,7 @@ import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
+from made_up_plan import made_up_plan
 import pytest
 from ruamel.yaml import YAML
 
@@ -19,12 +20,19 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
-from dlo_calibration.ros import diagnostics
+from dlo_calibration.planning import PlanProgress
+from dlo_calibration.ros import diagnostics, planner_diagnostics, planner_session
 
 ROOT = Path(__file__).resolve().parents[2]
-LAUNCH_FILE = ROOT / 'launch' / 'calibrator.launch.py'
-RVIZ, FOXGLOVE = ROOT / 'config' / 'calibrator.rviz', ROOT / 'config' / 'foxglove_layout.json'
-TOPICS = {f'/calibrator/{name}': kind for name, kind in {**INPUT_TYPES, **OUTPUT_TYPES}.items()}
+FOXGLOVE = {'calibrator': ROOT / 'config' / 'foxglove_layout.json',
+            'planner': ROOT / 'config' / 'planner_foxglove_layout.json'}
+TOPICS = {f'/{node}/{name}': kind for node, types in (
+    ('calibrator', {**INPUT_TYPES, **OUTPUT_TYPES}),
+    ('planner', {**planner_session.INPUT_TYPES, **planner_session.OUTPUT_TYPES}))
+    for name, kind in types.items()}
+#: Topics that both viewers show, or Foxglove alone.
+SHOWN = {'calibrator': ('markers', 'progress', 'status', 'result'),
+         'planner': ('markers', 'progress', 'status', 'chain', 'goal_chain', 'action', 'steps')}
 
 #: Modules that launch files import, with the names used here; each becomes a record of how it was called.
 LAUNCH_NAMES = {
@@ -37,9 +45,15 @@ LAUNCH_NAMES = {
 }
 
 
+@pytest.fixture(params=['calibrator', 'planner'])
+def node(request):
+    """Give the name of a node."""
+    return request.param
+
+
 @pytest.fixture
-def described(monkeypatch):
-    """Give what the launch file describes, with launch replaced by records of its calls."""
+def described(node, monkeypatch):
+    """Give what the launch file of a node describes, with launch replaced by records of its calls."""
     for module, names in LAUNCH_NAMES.items():
         replacement = ModuleType(module)
         for name in names:
@@ -50,29 +64,30 @@ def described(monkeypatch):
     index.get_package_share_directory = {'dlo_calibration': str(ROOT)}.__getitem__
     monkeypatch.setitem(sys.modules, 'ament_index_python.packages', index)
     monkeypatch.setitem(sys.modules, 'ament_index_python', ModuleType('ament_index_python'))
-    spec = importlib.util.spec_from_file_location('calibrator_launch', LAUNCH_FILE)
+    spec = importlib.util.spec_from_file_location(
+        f'{node}_launch', ROOT / 'launch' / f'{node}.launch.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.generate_launch_description().words[0]
 
 
-def test_launch_starts_the_node_with_its_parameter_file(described):
+def test_launch_starts_the_node_with_its_parameter_file(node, described):
     arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
-    node, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'dlo_calibration')
-    assert f"'{node.options['executable']} = " in (ROOT / 'setup.py').read_text(encoding='utf-8')
-    assert node.options['name'] == 'calibrator'
-    assert 'condition' not in node.options
-    flag, file = node.options['ros_arguments']
+    one, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'dlo_calibration')
+    assert f"f'{one.options['executable']} = " in (ROOT / 'setup.py').read_text(encoding='utf-8')
+    assert one.options['name'] == one.options['executable'] == node
+    assert 'condition' not in one.options
+    flag, file = one.options['ros_arguments']
     assert flag == '--params-file'
-    assert Path(arguments[file.words[0]]['default_value']) == ROOT / 'config' / 'calibrator.yaml'
+    assert Path(arguments[file.words[0]]['default_value']) == ROOT / 'config' / f'{node}.yaml'
 
 
-def test_launch_starts_rviz_only_where_it_is_asked_for(described):
+def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
     arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
     rviz, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'rviz2')
     asked, = rviz.options['condition'].words
     assert arguments[asked.words[0]]['default_value'] == 'false'
-    assert Path(rviz.options['arguments'][1]) == RVIZ
+    assert Path(rviz.options['arguments'][1]) == ROOT / 'config' / f'{node}.rviz'
     assert rviz.options['arguments'][0] == '-d'
 
 
@@ -82,30 +97,31 @@ def test_launch_arguments_are_described(described):
     assert all(one['description'] for one in arguments)
 
 
-def test_ros2_launch_knows_the_launch_file(install):
+def test_ros2_launch_knows_the_launch_file(node, install):
     if shutil.which('ros2') is None:
         pytest.skip('the command ros2 is not installed')
     done = subprocess.run(
-        ['sh', '-c', '. "$0" && exec ros2 launch dlo_calibration calibrator.launch.py --show-args',
-         install / 'setup.sh'], capture_output=True, text=True)
+        ['sh', '-c', '. "$0" && exec ros2 launch dlo_calibration "$1".launch.py --show-args',
+         install / 'setup.sh', node], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert 'params_file' in done.stdout
 
 
-def rviz_displays():
-    return YAML(typ='safe').load(RVIZ.read_text(encoding='utf-8'))['Visualization Manager']['Displays']
+def rviz_displays(node):
+    text = (ROOT / 'config' / f'{node}.rviz').read_text(encoding='utf-8')
+    return YAML(typ='safe').load(text)['Visualization Manager']['Displays']
 
 
-def test_rviz_shows_topics_of_the_contract_with_displays_of_their_types():
-    shown = {one['Topic']['Value']: one['Class'] for one in rviz_displays() if 'Topic' in one}
-    assert '/calibrator/markers' in shown
+def test_rviz_shows_topics_of_the_contract_with_displays_of_their_types(node):
+    shown = {one['Topic']['Value']: one['Class'] for one in rviz_displays(node) if 'Topic' in one}
+    assert f'/{node}/markers' in shown
     for topic, display in shown.items():
         assert display.split('/')[1] == TOPICS[topic].split('/')[2]
 
 
-def test_rviz_gets_markers_that_were_sent_before_it_started():
-    markers, = (one for one in rviz_displays()
-                if one.get('Topic', {}).get('Value') == '/calibrator/markers')
+def test_rviz_gets_markers_that_were_sent_before_it_started(node):
+    markers, = (one for one in rviz_displays(node)
+                if one.get('Topic', {}).get('Value') == f'/{node}/markers')
     assert markers['Topic']['Durability Policy'] == 'Transient Local'
     assert markers['Enabled'] is True
 
@@ -119,18 +135,18 @@ def texts(value):
     return [value] if isinstance(value, str) else []
 
 
-def foxglove_layout():
-    return json.loads(FOXGLOVE.read_text(encoding='utf-8'))
+def foxglove_layout(node):
+    return json.loads(FOXGLOVE[node].read_text(encoding='utf-8'))
 
 
-def test_foxglove_shows_topics_of_the_contract():
-    topics = {match[0] for text in texts(foxglove_layout()) if (match := re.match(r'/[\w/]+', text))}
+def test_foxglove_shows_topics_of_the_contract(node):
+    topics = {match[0] for text in texts(foxglove_layout(node)) if (match := re.match(r'/[\w/]+', text))}
     assert topics <= set(TOPICS)
-    assert topics >= {f'/calibrator/{name}' for name in ('markers', 'progress', 'status', 'result')}
+    assert topics >= {f'/{node}/{name}' for name in SHOWN[node]}
 
 
-def test_foxglove_shows_every_panel_that_is_set_up_and_no_other():
-    layout = foxglove_layout()
+def test_foxglove_shows_every_panel_that_is_set_up_and_no_other(node):
+    layout = foxglove_layout(node)
     named = {text for text in texts(layout['layout']) if '!' in text}
     assert named == set(layout['configById'])
 
@@ -140,12 +156,31 @@ def test_foxglove_plots_values_that_the_node_sends():
     message = diagnostics.progress(bag_types(), stamp=1, evaluation=best, best=best, evaluations=2,
                                    simulations_per_second=1.0, seconds_left=1.0,
                                    spread=dict.fromkeys(Options().calibrate, 1.0))
-    sent = {(one.name, pair.key) for one in message.status for pair in one.values}
-    plotted = {re.fullmatch(
-        r'/calibrator/progress\.status\[:\]\{name=="(\w+)"\}\.values\[:\]\{key=="(\w+)"\}\.value',
-        path['value']).groups()
-        for panel in foxglove_layout()['configById'].values() for path in panel.get('paths', [])}
-    assert plotted <= sent
-    assert {('progress', f'{what}_{name}') for name in Options().calibrate
+    plotted = foxglove_plots('calibrator')
+    assert plotted <= sent('progress', message)
+    assert {('progress', 'progress', f'{what}_{name}') for name in Options().calibrate
             for what in ('best', 'spread')} <= plotted
-    assert {('progress', 'score'), ('progress', 'best_score')} <= plotted
+    assert {('progress', 'progress', 'score'), ('progress', 'progress', 'best_score')} <= plotted
+
+
+def test_foxglove_plots_values_that_the_planner_sends():
+    types = bag_types()
+    progress = planner_diagnostics.plan_progress(types, PlanProgress(1, 10, 20, 0.01, 1.0), 1)
+    status = planner_diagnostics.planner_status(
+        types, stamp=1, state='done', detail='', missing=(), last_refusal='', description='', plans=1,
+        plan=made_up_plan())
+    plotted = foxglove_plots('planner')
+    assert plotted <= sent('progress', progress) | sent('status', status)
+    assert {('progress', 'progress', 'best_error_mm'), ('status', 'status', 'error_after_mm')} <= plotted
+
+
+def sent(topic, message):
+    return {(topic, one.name, pair.key) for one in message.status for pair in one.values}
+
+
+def foxglove_plots(node):
+    """List (topic, name of the status, key) of everything that is plotted."""
+    return {re.fullmatch(
+        rf'/{node}/(\w+)\.status\[:\]\{{name=="(\w+)"\}}\.values\[:\]\{{key=="(\w+)"\}}\.value',
+        path['value']).groups()
+        for panel in foxglove_layout(node)['configById'].values() for path in panel.get('paths', [])}

@@ -13,12 +13,12 @@ import time
 import pytest
 import toy_calibrator
 
+from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import INPUT_TYPES, rclpy_types
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 pytest.importorskip('diagnostic_msgs', reason='needs the message packages common_interfaces')
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from rcl_interfaces.msg import Log  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
@@ -36,24 +36,30 @@ TYPES = rclpy_types()
 class Robot:
     """Robot software: publishes, calls and listens; spins the node too, where it is in this process."""
 
+    name = 'calibrator'  # of the node
+    inputs = INPUT_TYPES
+    outputs = {name: OUTPUT_TYPES[name] for name in ('progress', 'status', 'result')}
+    unlatched = ('progress',)
+    services = ('start', 'stop', 'reset')
+
     def __init__(self, context, reliability=ReliabilityPolicy.RELIABLE):
         self.context = context
         self.node = Node('robot', context=context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         self.calibrator = None
-        self.heard = {'progress': [], 'status': [], 'result': [], 'log': []}
-        for name in ('progress', 'status', 'result'):
-            self.listen(name, LATCHED if name != 'progress' else QoSProfile(depth=1000))
+        self.heard = {'log': []}
+        for name, kind in self.outputs.items():
+            self.heard[name] = []
+            self.node.create_subscription(
+                TYPES.find(kind), f'/{self.name}/{name}', self.heard[name].append,
+                QoSProfile(depth=1000) if name in self.unlatched else LATCHED)
         self.node.create_subscription(Log, '/rosout', self.heard['log'].append, QoSProfile(depth=100))
         qos = QoSProfile(depth=1000, reliability=reliability)
-        self.publishers = {kind: self.node.create_publisher(TYPES.find(name), f'/calibrator/{kind}', qos)
-                           for kind, name in INPUT_TYPES.items()}
-        self.clients = {name: self.node.create_client(Trigger, f'/calibrator/{name}')
-                        for name in ('start', 'stop', 'reset')}
-
-    def listen(self, name, qos):
-        self.node.create_subscription(DiagnosticArray, f'/calibrator/{name}', self.heard[name].append, qos)
+        self.publishers = {kind: self.node.create_publisher(TYPES.find(name), f'/{self.name}/{kind}', qos)
+                           for kind, name in self.inputs.items()}
+        self.clients = {name: self.node.create_client(Trigger, f'/{self.name}/{name}')
+                        for name in self.services}
 
     def until(self, condition, why='it never happened'):
         begun = time.monotonic()
@@ -99,12 +105,12 @@ def whole(result):
 
 
 @contextmanager
-def robot_of(environment, **arguments):
+def robot_of(environment, kind=Robot, **arguments):
     context = Context()
     rclpy.init(args=[], context=context, domain_id=int(environment['ROS_DOMAIN_ID']),
                signal_handler_options=SignalHandlerOptions.NO)
     try:
-        robot = Robot(context, **arguments)
+        robot = kind(context, **arguments)
         yield robot
         robot.executor.shutdown()
         robot.node.destroy_node()

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration session behind a graph that is no ROS graph."""
+"""A session behind a graph that is no ROS graph."""
 
 from collections import defaultdict
 import time
@@ -27,33 +27,38 @@ def whole(result):
     return values(next(one for one in result.status if one.name == 'calibration'))
 
 
-class ToyGraph:
-    """A graph in which whatever is published is heard at once; `ahead` [s] lets time pass."""
+class ToyNode:
+    """
+    A graph in which whatever is published is heard at once; `ahead` [s] lets time pass.
 
-    def __init__(self, folder, make, **options):
-        self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
+    A subclass makes the `session`.
+
+    :param inputs: name of each topic -> its type; `outputs` likewise.
+    """
+
+    def __init__(self, name, inputs, outputs):
+        self.name, self.inputs, self.outputs = name, inputs, outputs
         self.ahead = 0.0
         self.heard, self.logged, self.waiting = defaultdict(list), defaultdict(list), []
         self.info, self.warn, self.error = (self.logged[level].append for level in ('info', 'warn', 'error'))
-        self.session = CalibrationSession(self, TYPES, make, lambda: time.monotonic() + self.ahead)
 
-    def options(self):
-        return Options.of({**Options().flat(), **self.set})
+    def clock(self):
+        return time.monotonic() + self.ahead
 
     def stamp(self):
         return MINUTE
 
     def topic(self, name):
-        return f'/calibrator/{name}'
+        return f'/{self.name}/{name}'
 
     def decode(self, kind, octets):
-        return typestore().deserialize_cdr(octets, INPUT_TYPES[kind])
+        return typestore().deserialize_cdr(octets, self.inputs[kind])
 
     def encode(self, name, message):
-        return encode(message, OUTPUT_TYPES[name])
+        return encode(message, self.outputs[name])
 
     def publish(self, name, octets):
-        self.heard[name].append(typestore().deserialize_cdr(octets, OUTPUT_TYPES[name]))
+        self.heard[name].append(typestore().deserialize_cdr(octets, self.outputs[name]))
 
     def hear_waiting(self):
         pairs, self.waiting = self.waiting, []
@@ -61,7 +66,7 @@ class ToyGraph:
 
     def send(self, pairs):
         for kind, message in pairs:
-            self.session.hear(kind, encode(message, INPUT_TYPES[kind]))
+            self.session.hear(kind, encode(message, self.inputs[kind]))
         self.session.tick()
 
     def until(self, condition):
@@ -74,6 +79,18 @@ class ToyGraph:
     @property
     def status(self):
         return values(self.heard['status'][-1].status[0])
+
+
+class ToyGraph(ToyNode):
+    """The graph of a calibration session."""
+
+    def __init__(self, folder, make, **options):
+        super().__init__('calibrator', INPUT_TYPES, OUTPUT_TYPES)
+        self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
+        self.session = CalibrationSession(self, TYPES, make, self.clock)
+
+    def options(self):
+        return Options.of({**Options().flat(), **self.set})
 
     def calibrated(self):
         """Start, and return the result."""
