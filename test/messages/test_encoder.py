@@ -12,7 +12,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.request import read_request, request_trials
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.collector import TrialCollector
-from dlo_calibration.messages.encoder import trial_messages
+from dlo_calibration.messages.encoder import action_message, trial_messages
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal, Trial
@@ -94,3 +94,16 @@ def test_actions_after_each_other_without_a_goal_between_keep_their_grips(action
     goal = Goal(Chain(POINTS + ASIDE), 8.0, True, held_by)
     trial = Trial('in turn', Chain(POINTS), tuple(actions), (goal,))
     assert_same(collected([trial]), [trial])
+
+
+def test_hands_with_times_of_their_own_share_the_waypoints_of_one_message():
+    half = 0.5**0.5
+    early = Hand('early', (0,), [1.0, 3.0], [[0, 0, 0], [0.2, 0, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
+    late = Hand('late', (5,), [2.0, 3.0, 4.0], [[1, 0, 0], [1, 0, 0.1], [1, 0.1, 0]])
+    message = action_message((early, late), 7, 'table')
+    assert (message.stamp, message.frame_id, message.names) == (7, 'table', ('early', 'late'))
+    np.testing.assert_array_equal(message.times, [0, 1, 2, 3])
+    np.testing.assert_allclose(message.positions[:, 0, 0], [0, 0.1, 0.2, 0.2])
+    np.testing.assert_allclose(message.positions[:, 1, 2], [0, 0, 0.1, 0])
+    np.testing.assert_allclose(2 * np.arcsin(message.orientations[:, 0, 2]), np.radians([0, 45, 90, 90]))
+    np.testing.assert_array_equal(message.orientations[:, 1], np.tile([0, 0, 0, 1], (4, 1)))

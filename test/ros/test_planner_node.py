@@ -66,7 +66,6 @@ def child(environment, *arguments):
 
 
 def test_plans_of_the_real_search_bring_the_dlo_nearer_and_ctrl_c_ends_it_while_it_plans(ros_environment):
-    # The tolerance cannot be reached, so that the last search goes on until it is interrupted.
     options = ('-p', f'description:={RESULT}', '-p', 'actions:=1', '-p', 'draws:=0', '-p', 'workers:=1',
                '-p', 'tolerance:=0.01')
     along = np.linspace(0, CHAIN.length, len(CHAIN))
@@ -83,17 +82,21 @@ def test_plans_of_the_real_search_bring_the_dlo_nearer_and_ctrl_c_ends_it_while_
                          for points in (CHAIN.points, predicted))
         assert after < 0.7 * before
         assert float(robot.status['error_before_mm']) == pytest.approx(1e3 * before, rel=0.01)
-        assert len(robot.heard['action']) == 1
-        robot.send_chains(Chain(predicted), goal)  # a robot did just that
-        assert robot.plan()['state'] == 'done', robot.status
-        assert float(robot.status['error_before_mm']) == pytest.approx(1e3 * after, rel=0.01)
-        begun = len(robot.heard['progress'])
+        robot.until(lambda: robot.heard['action'] and robot.heard['progress'])
+        for _ in range(10):  # a tracker's stream: the newest chain may arrive after the request
+            robot.send_chains(Chain(predicted), goal)  # a robot did just that
+            assert robot.plan()['state'] == 'done', robot.status
+            if float(robot.status['error_before_mm']) == pytest.approx(1e3 * after, rel=0.01):
+                break
+        else:
+            pytest.fail(f'it plans from an old chain: {robot.status}')
+        robot.until(lambda: len(robot.heard['action']) == int(robot.status['plans']))
+        actions = len(robot.heard['action'])
         assert robot.call('plan').success
-        robot.until(lambda: len(robot.heard['progress']) > begun)
         for _ in range(2):  # to its processes too, as Ctrl-C in a terminal
             os.killpg(process.pid, signal.SIGINT)
         assert ended(process) == 0
-        assert len(robot.heard['action']) <= 2  # an interrupted plan is for nobody
+        assert len(robot.heard['action']) == actions  # nobody should execute an interrupted plan
 
 
 def test_a_description_that_was_latched_before_is_heard_and_none_is_published(robot):

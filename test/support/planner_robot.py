@@ -30,10 +30,11 @@ class PlannerRobot(Robot):
         self.until(lambda: not {'chain', 'goal_chain'} & set(self.status['missing'].split()))
 
     def plan(self):
-        """Plan, and return the status."""
-        count = int(self.status['plans'])
+        """Plan, and return the status when the steps are here, too."""
+        count, steps = int(self.status['plans']), len(self.heard['steps'])
         answer = self.call('plan')
         assert answer.success, answer.message
         self.until(lambda: self.status['plans'] == str(count + 1)
                    and self.status['state'] in ('done', 'failed'))
+        self.until(lambda: self.status['state'] == 'failed' or len(self.heard['steps']) > steps)
         return self.status
