@@ -25,6 +25,7 @@ ALIKE = 0.01  # of the length; of sequences that end nearer to each other, the b
 GAIN = 0.02  # share of the cost that an action must gain
 NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
+PATIENCE = 1  # actions that need not gain anything, before one that may
 
 Result = TypeVar('Result')
 Asking = Generator[list[Job], Sequence[Rehearsal], Result]
@@ -108,28 +109,27 @@ class BeamSearch:
     reaches the goal are refined together.
 
     :param start: the DLO before the first move.
-    :param level: height [m] at which points are put down.
+    :param levels: (n,) heights [m] at which the points are put down.
     :param physical: found parameters; `draws` from the posterior (SI units).
     """
 
     def __init__(self, start: Chain, objective: Objective, options: PlanOptions, limits: Refusing,
-                 level: float, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]) -> None:
-        self._start, self._length = start, start.length
+                 levels: Floats, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]) -> None:
+        self._start = start
         self._objective, self._options, self._limits = objective, options, limits
-        self._level, self._physical, self._draws = level, physical, draws
+        self._levels, self._physical, self._draws = levels, physical, draws
         self._crossings = max(crossings(start.points), crossings(objective.goal))
         self._root = Course((), start.points[None], objective.cost(start.points))
-        self.best: Course = self._root  # the most promising sequence so far
+        self.best: Course = self._root  # the sequence that gets nearest with the found parameters, so far
+        self.actions = 0  # of the sequences that are tried now
         self.judged: Judged | None = None  # the best one that was simulated with draws
         self.refusals: dict[str, int] = {}  # why moves were refused -> how often
+        self._watched = bool(options.no_go)  # whether the way of the DLO matters
+        self._pool: list[Course] = []  # all sequences that were kept
+        self._known: set[Course] = set()  # those that were judged
         self.stop_reason = ''
         self._asking = self._search()
         self._jobs: list[Job] = next(self._asking, [])
-
-    @property
-    def depth(self) -> int:
-        """Number of actions of the sequences that are tried now."""
-        return len(self.best.moves) + 1
 
     def ask(self) -> list[Job]:
         """Return sequences to rehearse; none once the search has ended."""
@@ -148,6 +148,11 @@ class BeamSearch:
         self._jobs = next(self._asking, [])
 
     @property
+    def reached(self) -> bool:
+        """Whether the start, or the end of the best judged sequence, is within the tolerance of the goal."""
+        return self._judged_cost <= self._objective.enough
+
+    @property
     def expected(self) -> int:
         """Number of actions to simulate if all permitted actions are needed; an estimate."""
         actions = self._options.actions
@@ -158,31 +163,61 @@ class BeamSearch:
         return int(following * (1 + WIDTH * (actions - 1))
                    + actions * (displacements + TOGETHER * len(SHARES) + 1 + len(self._draws)))
 
-    def _conclude(self, reason: str) -> Asking[None]:
-        """Judge the best sequence so far, unless it is judged."""
-        if self.best.moves and (self.judged is None or self.judged.course is not self.best):
-            yield from self._judge(self.best)
-        self.stop_reason = reason
-
     def _search(self) -> Asking[None]:
-        if self._root.cost <= self._objective.enough:
+        if self.reached:
             self.stop_reason = 'the start is within the tolerance of the goal'
             return
-        beam, reason = [self._root], f'the largest number of actions, {self._options.actions}'
-        while len(self.best.moves) < self._options.actions:
+        beam, reason, stalled = [self._root], f'the largest number of actions, {self._options.actions}', 0
+        for count in range(1, self._options.actions + 1):
+            self.actions, before = count, self.best.cost
             beam = yield from self._grown(beam)
-            if not beam or beam[0].cost > (1 - GAIN) * self.best.cost:
+            if not beam:
+                reason = 'no further action is permitted'
+                break
+            stalled = 0 if beam[0].cost < (1 - GAIN) * before else stalled + 1
+            if stalled > PATIENCE:
                 reason = 'no further action brings it nearer'
                 break
-            self.best = beam[0]
-            last = len(self.best.moves) == self._options.actions
-            if self.best.cost < NEAR * self._objective.enough or last:
-                self.best = beam[0] = yield from self._together(self.best)
-                if self.best.cost <= self._objective.enough and (
-                        yield from self._judge(self.best)) <= self._objective.enough:
-                    reason = 'the goal is reached'
-                    break
+            beam = yield from self._completed(beam, last=count == self._options.actions)
+            if self.reached:
+                reason = 'the goal is reached'
+                break
         yield from self._conclude(reason)
+
+    @property
+    def _judged_cost(self) -> float:
+        """Cost after the best judged sequence, or without any action."""
+        return self._root.cost if self.judged is None else self.judged.cost
+
+    def _completed(self, beam: list[Course], last: bool) -> Asking[list[Course]]:
+        """
+        Refine the sequences that nearly reach the goal, and judge those that do.
+
+        :param last: they cannot be continued, so they are all refined and judged.
+        :returns: all sequences, best first.
+        """
+        near = [course for course in beam if last or course.cost < NEAR * self._objective.enough]
+        for group in (near[:1], near[1:]):  # the others are seldom needed
+            refined = yield from self._together(group)
+            yield from self._judge([one for one in refined if last or one.cost <= self._objective.enough])
+            beam = [*(one for one in beam if one not in group), *refined]
+            if self.reached:
+                break
+        beam.sort(key=lambda course: course.cost)
+        self._pool += beam
+        return beam
+
+    def _conclude(self, reason: str) -> Asking[None]:
+        """Judge the most promising sequences so far, until one of them is permitted."""
+        pool = sorted((course for course in dict.fromkeys([*self._pool, self.best])
+                       if course not in self._known and course.cost < self._judged_cost),
+                      key=lambda course: course.cost)
+        if pool:
+            yield from self._judge(pool[:1])
+        for first in range(1, len(pool), WIDTH):
+            if self.judged is None:
+                yield from self._judge(pool[first:first + WIDTH])
+        self.stop_reason = reason
 
     def _grown(self, beam: Sequence[Course]) -> Asking[list[Course]]:
         """Return the best sequences with one more move, best first."""
@@ -208,16 +243,15 @@ class BeamSearch:
     def _distinct(self, courses: Sequence[Course]) -> list[Course]:
         found: list[Course] = []
         for course in courses:
-            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * self._length
+            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * self._start.length
                    for other in found):
                 found.append(course)
         return found
 
-    def _together(self, course: Course) -> Asking[Course]:
-        """Return a sequence whose displacements were refined all at once."""
-        draft = Draft(self._root, course.moves, course.chains[:-1])
-        found, = yield from self._refined([draft], [course], TOGETHER)
-        return found if found.cost < course.cost else course
+    def _together(self, courses: Sequence[Course]) -> Asking[list[Course]]:
+        """Return sequences whose displacements were refined all at once."""
+        drafts = [Draft(self._root, course.moves, course.chains[:-1]) for course in courses]
+        return (yield from self._refined(drafts, courses, TOGETHER))
 
     def _refined(self, drafts: Sequence[Draft], seen: Sequence[Course], iterations: int
                  ) -> Asking[list[Course]]:
@@ -245,7 +279,7 @@ class BeamSearch:
         """Return the courses that drafts become; None where one is not permitted or cannot be simulated."""
         permitted = [draft for draft in drafts if self._permits(draft)]
         jobs = [Job(self._chain(draft.base), self._steps(draft.moves, draft.before), self._physical,
-                    courses=bool(self._options.no_go)) for draft in permitted]
+                    self._watched) for draft in permitted]
         told = (yield jobs) if jobs else []
         found = {id(draft): self._course(draft, one) for draft, one in zip(permitted, told, strict=True)}
         return [found.get(id(draft)) for draft in drafts]
@@ -254,7 +288,7 @@ class BeamSearch:
         return self._start if not course.moves else Chain(course.end)
 
     def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[Step, ...]:
-        return in_turn([move.step(points, self._level, self._options.height, self._options.speed)
+        return in_turn([move.step(points, self._levels, self._options.height, self._options.speed)
                         for move, points in zip(moves, before, strict=True)])
 
     def _permits(self, draft: Draft) -> bool:
@@ -271,25 +305,32 @@ class BeamSearch:
 
     def _course(self, draft: Draft, seen: Rehearsal) -> Course | None:
         """Return the course that a draft becomes; None if it failed or is not permitted."""
-        if seen.failure:
+        if seen.failure or not self._allowed(self._forbidden(seen)):
             return None
-        for course in seen.courses:
-            if not self._allowed(self._limits.entered(course)):
-                return None
-        if not self._options.crossings and any(crossings(chain) > self._crossings for chain in seen.chains):
-            self._allowed('the DLO would cross itself')
-            return None
-        return Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
-                      self._objective.cost(seen.chains[-1]))
+        found = Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
+                       self._objective.cost(seen.chains[-1]))
+        if found.cost < self.best.cost:
+            self.best = found
+        return found
 
-    def _judge(self, course: Course) -> Asking[float]:
-        """Simulate a course at once, with the found parameters and with the draws; return its mean cost."""
-        steps = self._steps(course.moves, course.chains[:-1])
-        best, *drawn = yield [Job(self._start, steps, physical)
-                              for physical in (self._physical, *self._draws)]
-        drawn = [one for one in drawn if not one.failure]
-        costs = [self._objective.cost(one.chains[-1]) for one in drawn or [best]]
-        judged = Judged(course, steps, best, tuple(drawn), float(np.mean(costs)))
-        if not best.failure and (self.judged is None or judged.cost < (1 - GAIN) * self.judged.cost):
-            self.judged = judged
-        return judged.cost
+    def _forbidden(self, seen: Rehearsal) -> str:
+        """Return why the DLO must not move like this; empty if it may."""
+        if not self._options.crossings and any(crossings(chain) > self._crossings for chain in seen.chains):
+            return 'the DLO crosses itself'
+        return self._limits.entered(np.concatenate([*seen.courses, seen.chains]))
+
+    def _judge(self, courses: Sequence[Course]) -> Asking[None]:
+        """Simulate courses at once, with the found parameters and with the draws."""
+        each = [self._physical, *self._draws]
+        planned = [self._steps(course.moves, course.chains[:-1]) for course in courses]
+        jobs = [Job(self._start, steps, physical, self._watched) for steps in planned for physical in each]
+        told = (yield jobs) if jobs else []
+        self._known.update(courses)
+        for k, (course, steps) in enumerate(zip(courses, planned, strict=True)):
+            best, *drawn = told[k * len(each):(k + 1) * len(each)]
+            drawn = [one for one in drawn if not one.failure]
+            if best.failure or not all(self._allowed(self._forbidden(one)) for one in (best, *drawn)):
+                continue
+            cost = float(np.mean([self._objective.cost(one.chains[-1]) for one in drawn or [best]]))
+            if cost < (1 - GAIN) * self._judged_cost:
+                self.judged = Judged(course, steps, best, tuple(drawn), cost)

@@ -5,15 +5,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Mapping, Protocol
 
 import numpy as np
 
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import ParameterEstimate
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
+from dlo_calibration.observation.table import lying_level
 
 Z90 = 1.6449  # standard deviations from the middle of a normal distribution to an end of its 90 % interval
 
@@ -55,6 +57,7 @@ class Posterior:
     :param values: (d,) found values on the 0..100 scale, in the order of `space.free`.
     :param below: (d,) standard deviation below them; `above` (d,) above them.
     :param correlations: (d, d).
+    :param thickest: largest self-collision radius [m] of a draw.
     """
 
     space: ParameterSpace
@@ -63,6 +66,7 @@ class Posterior:
     below: Floats
     above: Floats
     correlations: Floats
+    thickest: float = np.inf
 
     @classmethod
     def of(cls, found: CalibratedDlo) -> Posterior:
@@ -77,6 +81,19 @@ class Posterior:
                    frozen_array(np.maximum([one.upper for one in estimates] - values, 0) / Z90),
                    frozen_array(np.where(np.isfinite(correlations), correlations, np.eye(len(values)))))
 
+    def lying(self, chain: Chain, simulation: Options) -> Posterior:
+        """
+        Return the distribution for a DLO that is seen lying on the table.
+
+        It is not thicker than it lies high: trials in which it does not touch itself leave its radius
+        open, and a draw with a far larger one would push its parts away from each other.
+        """
+        level = lying_level(chain, simulation.table_height) if simulation.table and not simulation.scene \
+            else None
+        if level is None:
+            return self
+        return replace(self, thickest=max(level - simulation.table_height, self.best['self_collision']))
+
     @property
     def best(self) -> dict[str, float]:
         """Physical values of all parameters at the found values, in SI units."""
@@ -88,7 +105,8 @@ class Posterior:
         normal = np.random.default_rng(seed).standard_normal((count, len(self.values)))
         normal = normal * np.sqrt(np.maximum(variances, 0)) @ axes.T
         drawn = self.values + normal * np.where(normal < 0, self.below, self.above)
-        return [self._physical(one) for one in np.clip(drawn, 0.0, SCALE)]
+        physical = [self._physical(one) for one in np.clip(drawn, 0.0, SCALE)]
+        return [{**one, 'self_collision': min(one['self_collision'], self.thickest)} for one in physical]
 
     def _physical(self, values: Floats) -> dict[str, float]:
         named = dict(zip(self.space.free, map(float, values), strict=True))

@@ -41,20 +41,20 @@ class Move:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'shifts', frozen_array(np.reshape(self.shifts, (len(self.grips), 2))))
 
-    def step(self, points: Floats, level: float, height: float, speed: float) -> Step:
+    def step(self, points: Floats, levels: Floats, height: float, speed: float) -> Step:
         """
         Return the paths of the hands, which have waypoints at the same times, and open at the end.
 
         :param points: (n, 3) [m] the DLO before the action.
-        :param level: height [m] at which the points are put down.
+        :param levels: (n,) heights [m] at which the points are put down.
         :param height: of a lift above the highest place [m].
         :param speed: of the faster hand [m/s].
         """
-        begin = points[list(self.grips)]
-        end = np.column_stack([begin[:, :2] + self.shifts, np.full(len(begin), level)])
+        begin, level = points[list(self.grips)], levels[list(self.grips)]
+        end = np.column_stack([begin[:, :2] + self.shifts, level])
         way = [begin, end]
         if self.name == LIFTING:
-            top = np.full((len(begin), 1), max(begin[:, 2].max(), level) + height)
+            top = np.full((len(begin), 1), max(begin[:, 2].max(), level.max()) + height)
             way = [begin, np.hstack([begin[:, :2], top]), np.hstack([end[:, :2], top]), end]
         kept, times = [way[0]], [0.0]
         for place in way[1:]:

@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError, Executor
 from contextlib import ExitStack
 from dataclasses import dataclass
 import time
-from typing import Callable
+from typing import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.model.chain import Chain, frozen_array
+from dlo_calibration.observation.table import lying_level
 from dlo_calibration.planning.beam import BeamSearch, Judged
+from dlo_calibration.planning.checks import checked, remarks
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
 from dlo_calibration.planning.limits import Limits
 from dlo_calibration.planning.objective import Objective
@@ -27,19 +29,17 @@ from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.prediction import intervals
 from dlo_calibration.planning.rehearsal import Rehearser
 
-RESTING_SHARE = 15.0  # % of the points of a DLO that are at most as high as those on the table
-
 
 @dataclass(frozen=True)
 class PlanProgress:
     """
-    How far a plan is.
+    How far a plan has come.
 
     :param actions: number of actions of the sequences that are tried now.
     :param rollouts: number of actions simulated so far.
-    :param expected: estimate of their number in the end.
+    :param expected: estimate of their number if all permitted actions are needed.
     :param best_error: mean distance of the points from the goal after the best sequence so far [m].
-    :param seconds_left: estimate.
+    :param seconds_left: until then.
     """
 
     actions: int
@@ -64,44 +64,49 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     :param simulation: options of the simulation; None: the defaults.
     :param should_stop: once it is True, the best plan so far is returned.
     :param executor: simulates; None: as many processes as the options say, for this plan only.
-    :raises InputError: if start, goal and DLO do not belong together.
+    :raises InputError: if start, goal and DLO do not belong together; see `checked`.
     """
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
-    posterior = Posterior.of(found)
-    objective = Objective(start, goal, options.objective, options.tolerance / 100 * found.length)
-    search = BeamSearch(start, objective, options, Limits.of(options), resting_height(start), posterior.best,
+    start, goal = checked(found, start, goal, simulation, options)
+    posterior = Posterior.of(found).lying(start, simulation)
+    tolerance = options.tolerance / 100 * found.length
+    objective = Objective(start, goal, options.objective, tolerance)
+    level = None if simulation.scene else lying_level(start, simulation.table_height)
+    search = BeamSearch(start, objective, options, Limits.of(options),
+                        goal.points[:, 2] if level is None else np.full(len(start), level), posterior.best,
                         posterior.draws(options.draws, options.seed))
+
+    def tell(rollouts: int) -> None:
+        expected = max(search.expected, rollouts)
+        left = (clock() - begin) * (expected - rollouts) / rollouts
+        on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end), left))
+
     with ExitStack() as stack:
         simulator = make_simulator(simulation)
         stack.callback(simulator.close)
         if executor is None and options.workers != 1:
             executor = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
             stack.callback(executor.close)
-        rehearse = Rehearser(simulator, executor, should_stop)
+        rehearse, last = Rehearser(simulator, executor, should_stop), Rehearser(simulator, executor)
         try:
             while jobs := search.ask():
                 search.tell(rehearse(jobs))
-                seconds = clock() - begin
-                expected = max(search.expected, rehearse.count)
-                on_progress(PlanProgress(search.depth, rehearse.count, expected,
-                                         objective.error(search.best.end),
-                                         seconds * (expected - rehearse.count) / max(rehearse.count, 1)))
+                tell(rehearse.count)
         except CancelledError:
             search.stop()
-            finish = Rehearser(simulator, executor)
             while jobs := search.ask():
-                search.tell(finish(jobs))
-        rollouts = rehearse.count
-    actions = planned_actions(search.judged, found.errors.rms) if search.judged else ()
-    ends = [one.chains[-1] for one in search.judged.drawn or (search.judged.best,)] \
-        if search.judged and actions else [start.points]
-    error = float(np.mean([objective.error(end) for end in ends]))
-    cost = float(np.mean([objective.cost(end) for end in ends]))
+                search.tell(last(jobs))
+        said = () if search.reached else (*remarks(last, posterior, start, goal, options),
+                                          *_remarks_on_refusals(search.refusals))
+    ends = [start.points] if search.judged is None else [
+        one.chains[-1] for one in search.judged.drawn or [search.judged.best]]
     return Plan(
-        start=start, goal=goal, actions=actions, error_before=objective.error(start.points),
-        error_after=error, score_after=float(np.mean([objective.score(end) for end in ends])),
-        reached=cost <= objective.enough, tolerance=options.tolerance / 100 * found.length, rollouts=rollouts,
-        seconds=clock() - begin, seed=options.seed, stop_reason=search.stop_reason)
+        start, goal, () if search.judged is None else planned_actions(search.judged, found.errors.rms),
+        error_before=objective.error(start.points),
+        error_after=float(np.mean([objective.error(end) for end in ends])),
+        score_after=float(np.mean([objective.score(end) for end in ends])), reached=search.reached,
+        tolerance=tolerance, rollouts=rehearse.count + last.count, seconds=clock() - begin,
+        seed=options.seed, stop_reason=search.stop_reason, remarks=said)
 
 
 def planned_actions(judged: Judged, error: float) -> tuple[PlannedAction, ...]:
@@ -117,7 +122,8 @@ def planned_actions(judged: Judged, error: float) -> tuple[PlannedAction, ...]:
         for k, (move, step) in enumerate(zip(judged.course.moves, judged.steps, strict=True)))
 
 
-def resting_height(chain: Chain) -> float:
-    """Return the height [m] of the points of a DLO that lie on the table."""
-    z = chain.points[:, 2]
-    return float(np.median(z[z <= np.percentile(z, RESTING_SHARE)]))
+def _remarks_on_refusals(refusals: Mapping[str, int]) -> Iterator[str]:
+    """Tell what prevented most of the moves that were not permitted."""
+    if refusals:
+        most = max(refusals, key=lambda why: refusals[why])
+        yield f'{sum(refusals.values())} moves that were tried are not permitted, mostly because {most}'

@@ -84,8 +84,9 @@ def simulate(found: CalibratedDlo, chain: Chain,
     """
     if not actions:
         raise InputError('simulate', 'no action', 'at least one', 'say what the hands do')
-    posterior = Posterior.of(found)
-    with closing(make_simulator(options or Options())) as simulator:
+    options = options or Options()
+    posterior = Posterior.of(found).lying(chain, options)
+    with closing(make_simulator(options)) as simulator:
         rehearse = Rehearser(simulator, should_stop=should_stop)
         steps, best = _steps(rehearse, chain, actions, posterior.best)
         drawn = rehearse([Job(chain, steps, physical) for physical in posterior.draws(draws, seed)])
