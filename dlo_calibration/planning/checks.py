@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Iterator
+from typing import Iterator, Mapping
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.observation.table import HANGING, lying_level
 from dlo_calibration.planning.crossings import crossings
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
@@ -145,12 +146,7 @@ def _remarks_on_limits(start: Chain, goal: Chain, options: PlanOptions) -> Itera
 
 def _remarks_on_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
                      options: PlanOptions) -> Iterator[str]:
-    """
-    Lay the DLO exactly on the goal, let it go, and tell how far it moves.
-
-    On the table, friction holds a curvature kappa(s) where the lateral force of a bent rod without tension,
-    EI d2(kappa)/ds2, is at most mu m g / L; and no friction holds a curvature at a free end.
-    """
+    """Lay the DLO exactly on the goal, let it go, and tell how far it moves."""
     middle = len(goal) // 2
     touch = Step(Action((Hand(HANDS[0], (middle,), np.zeros(1), goal.points[[middle]]),)))
     drawn = posterior.draws(min(DRAWS, options.draws), options.seed)
@@ -166,7 +162,22 @@ def _remarks_on_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
         yield (f'laid exactly on the goal and let go, the DLO springs back by {_mm(each.mean())} on average '
                f'({_percent(each.mean(), goal)} of the length; {_mm(each.min())} to {_mm(each.max())} within '
                f'the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at {at[worst]:.2f} '
-               'of the length: it is stiffer than friction can hold there')
+               'of the length: friction holds only bends with a radius above about '
+               f'{_mm(sharpest_bend(posterior.best, goal.length))}, and none at the ends')
+
+
+def sharpest_bend(physical: Mapping[str, float], length: float) -> float:
+    """
+    Return about the smallest radius of a bend [m] that friction on the table holds.
+
+    The lateral force of a bent rod without tension is EI kappa'' per length, which is at most mu m g / L in
+    equilibrium.  A bend of the radius R begins and ends within about R, so kappa'' is about 1 / R^3.
+
+    :param physical: parameters by name (SI units).
+    :param length: of the DLO [m].
+    """
+    held = physical['friction'] * physical['mass'] * GRAVITY / length
+    return float(np.cbrt(physical['flexibility'] / held))
 
 
 def _percent(length: float, chain: Chain) -> str:

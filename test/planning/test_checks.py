@@ -8,11 +8,12 @@ from dataclasses import replace
 from calibrated import HOSE, LENGTH, LEVEL, MadeUpDlo, ROPE, straight
 import numpy as np
 import pytest
+from toy_simulator import ToySimulator
 
 from dlo_calibration import Chain, InputError, Options
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.files.chain_file import read_chain_file
-from dlo_calibration.planning.checks import checked, remarks
+from dlo_calibration.planning.checks import checked, remarks, sharpest_bend
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.rehearsal import Rehearser
@@ -159,6 +160,34 @@ def test_a_stiff_dlo_springs_back_and_a_large_tolerance_makes_that_unimportant()
     assert 10 < back < end < 300
     assert told(arc(4.0), MadeUpDlo(HOSE), tolerance=90.0) == ()
     assert told(arc(4.0)) == ()  # the rope stays
+
+
+def bent(radius):
+    """Return a DLO with a bend of 90 degrees in its middle, between straight parts; radius in lengths."""
+    along = np.linspace(0, 1, 2001)
+    heading = np.clip((along - 0.5) / radius + np.pi / 4, 0, np.pi / 2)
+    x, y = (np.concatenate([[0], np.cumsum(f((heading[1:] + heading[:-1]) / 2) * along[1])])
+            for f in (np.cos, np.sin))
+    return laid(x[::100], y[::100])
+
+
+def test_the_sharpest_bend_that_friction_holds_is_told():
+    """With stiffness EI = 2e-3 N m^2, friction 0.4 and a weight of 0.6 N/m it is (2e-3 / 0.24)^(1/3) m."""
+    known = {'flexibility': 2e-3, 'friction': 0.4, 'mass': 0.06 / 9.81}
+    assert sharpest_bend(known, 0.1) == pytest.approx(0.2027, rel=1e-3)
+    stiff = MadeUpDlo({**HOSE, 'flexibility': (50.0, 49.0, 51.0)})
+    radius = sharpest_bend(Posterior.of(stiff).best, LENGTH) / LENGTH
+    assert 0.1 < radius < 0.3
+    assert told(bent(1.2 * radius), stiff) == ()
+    sentence, = told(bent(0.5 * radius), stiff)
+    assert f'friction holds only bends with a radius above about {1e3 * LENGTH * radius:.0f} mm' in sentence
+
+
+def test_a_goal_that_cannot_be_simulated_is_told():
+    found = MadeUpDlo()
+    sentence, = remarks(Rehearser(ToySimulator(fail_below=101)), Posterior.of(found), straight(), arc(1.5),
+                        PlanOptions(draws=0))
+    assert sentence.startswith('whether the DLO stays on the goal cannot be told: ')
 
 
 def test_a_goal_of_another_length_cannot_be_met():
