@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The examples do what they say, with the node."""
+"""The examples do what they say, with the nodes."""
 
+import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -12,21 +14,22 @@ from graph import child, ended
 
 from dlo_calibration.files.session import read_session
 
-EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
+ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0  # s
 
 
-def robot_session(environment):
-    done = subprocess.run([sys.executable, EXAMPLES / 'robot_session.py'], env=environment, text=True,
-                          capture_output=True, timeout=PATIENCE)
+def example(environment, name, *words):
+    """Execute an example; return what it logs."""
+    done = subprocess.run([sys.executable, ROOT / 'examples' / name, *words], text=True, capture_output=True,
+                          env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     return done.stderr
 
 
 def test_robot_session_sends_a_trial_starts_and_hears_the_result(ros_environment, tmp_path):
-    with child(ros_environment, tmp_path / 'out', '-p', 'evaluations:=5') as process:
-        heard = robot_session(ros_environment)
-        again = robot_session(ros_environment)
+    with child(ros_environment, tmp_path / 'out', '-p', 'evaluations:=5', '-p', 'workers:=1') as process:
+        heard = example(ros_environment, 'robot_session.py')
+        again = example(ros_environment, 'robot_session.py')
         process.send_signal(signal.SIGINT)
         assert ended(process) == 0
     for name in ('flexibility', 'elasticity', 'friction', 'self_collision', 'calibration'):
@@ -35,3 +38,23 @@ def test_robot_session_sends_a_trial_starts_and_hears_the_result(ros_environment
     assert 'calibrating on 2 trial(s), 5 evaluations' in again
     folder, = (tmp_path / 'out').iterdir()
     assert len(read_session(folder).messages) == 6
+
+
+def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environment):
+    planner = subprocess.Popen(
+        [sys.executable, '-m', 'dlo_calibration.ros.planner', '--ros-args', '-p', 'workers:=1',
+         '-p', f'description:={ROOT / "msg_samples" / "xml" / "dlo.xml"}',
+         '-p', 'tolerance:=12.0', '-p', 'draws:=0'],  # one action is enough
+        env={**ros_environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stderr=subprocess.PIPE, text=True)
+    try:
+        heard = example(ros_environment, 'closed_loop.py', '--pace', '50')
+        planner.send_signal(signal.SIGINT)
+        assert ended(planner) == 0
+    finally:
+        planner.kill()
+        planner.communicate()
+    before, predicted, after = (float(one) for one in re.findall(r'([\d.]+) % of the length', heard))
+    assert before > 20
+    assert predicted < 12 and after < 12
+    assert abs(after - predicted) < 2
+    assert 'the planner says: The DLO is at the goal already' in heard
