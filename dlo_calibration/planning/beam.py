@@ -21,7 +21,7 @@ from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearsal, Step
 
 WIDTH = 3  # sequences that are continued
 KEPT = 4  # moves after each sequence that are refined
-ALIKE = 0.01  # of the length; of sequences that end nearer to each other, the better one is continued
+ALIKE = 0.2  # of the error; of sequences that end nearer to each other, the better one is continued
 GAIN = 0.02  # share of the cost that an action must gain
 NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
@@ -241,10 +241,11 @@ class BeamSearch:
         return self._distinct(sorted(refined, key=lambda course: course.cost))[:WIDTH]
 
     def _distinct(self, courses: Sequence[Course]) -> list[Course]:
+        """Return courses, best first, without those that end almost like a better one."""
         found: list[Course] = []
         for course in courses:
-            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * self._start.length
-                   for other in found):
+            least = ALIKE * self._objective.error(course.end)
+            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > least for other in found):
                 found.append(course)
         return found
 

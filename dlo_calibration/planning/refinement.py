@@ -61,7 +61,7 @@ def refine(start: Best[Seen], residuals: Callable[[Seen], Floats], iterations: i
         seen = yield points
         tried += [Best(point, one) for point, one in zip(points, seen, strict=True) if one is not None]
         costs = [float(np.sum(residuals(one.seen)**2)) for one in tried]
-        if not tried or min(costs) > WORTH * float(here @ here):
+        if not tried or min(costs) >= WORTH * float(here @ here):
             break
         moved = tried[int(np.argmin(costs))]
         change = moved.point - best.point

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Moves, objectives and the refinement of displacements."""
+
+from calibrated import LEVEL, straight
+import numpy as np
+import pytest
+
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.named_actions import Drag, GraspAndPlace
+from dlo_calibration.model.score import difference_score
+from dlo_calibration.planning.moves import carrying, Move
+from dlo_calibration.planning.objective import Objective
+from dlo_calibration.planning.refinement import Best, refine
+
+LEVELS = np.full(21, LEVEL)
+TO = (0.2, 0.1, LEVEL)
+
+
+@pytest.mark.parametrize(('name', 'named'), [
+    ('grasp_and_place', GraspAndPlace(point=7, to=TO, height=0.04, speed=0.2, hand='hand_1')),
+    ('drag', Drag(point=7, to=TO, speed=0.2, hand='hand_1'))])
+def test_one_hand_moves_as_in_the_named_action(name, named):
+    points = straight().points
+    move = Move(name, (7,), ('hand_1',), np.array(TO[:2]) - points[7, :2])
+    found, = move.step(points, LEVELS, 0.04, 0.2).action.hands
+    expected, = named.action(straight()).hands
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-12)
+    np.testing.assert_allclose(found.times, expected.times, atol=1e-12)
+    assert (found.name, found.grips) == (expected.name, expected.grips)
+
+
+def test_two_hands_arrive_together_and_the_faster_one_has_the_speed():
+    move = Move('grasp_and_place', (2, 18), ('hand_2', 'hand_1'), np.array([[0.0, 0.1], [0.05, 0.0]]))
+    first, second = move.step(straight().points, LEVELS, 0.05, 0.1).action.hands
+    np.testing.assert_array_equal(first.times, second.times)
+    np.testing.assert_allclose(first.times, [0.0, 0.5, 1.5, 2.0])
+    assert (first.name, second.name) == ('hand_2', 'hand_1')
+
+
+def test_a_hand_that_stays_where_it_is_only_lifts():
+    still, lifted = (Move(name, (3,), ('hand_1',), np.zeros(2)).step(straight().points, LEVELS, 0.05, 0.1)
+                     for name in ('drag', 'grasp_and_place'))
+    assert still.action.start == still.action.end == 0
+    np.testing.assert_allclose(lifted.action.hands[0].positions[:, 2] - LEVEL, [0, 0.05, 0], atol=1e-12)
+
+
+def test_moves_carry_points_to_their_places_in_the_goal():
+    start, goal = straight().points, straight().points + [0.1, 0.2, 0.0]
+    one = carrying(start, goal, ('drag',), 1)
+    assert {choices[0].grips for choices in one} >= {(0,), (10,), (20,)}
+    assert all(len(choices) == 1 for choices in one)
+    two = carrying(start, goal, ('drag', 'grasp_and_place'), 2)
+    assert {choices[0].name for choices in two} == {'drag', 'grasp_and_place'}
+    assert (0, 20) in {choices[0].grips for choices in two}
+    for choices in two:
+        assert len({move.hands for move in choices}) == 2
+        for move in choices:
+            np.testing.assert_allclose(move.shifts, np.tile([0.1, 0.2], (len(move.grips), 1)))
+
+
+def test_residuals_are_as_long_as_the_cost():
+    start, goal = straight(), Chain(straight().points + [0.01, 0.02, 0.0])
+    points = Objective(start, goal, 'points', 0.005)
+    assert points.cost(start.points) == pytest.approx(np.hypot(0.01, 0.02)) == points.error(start.points)
+    assert points.enough == 0.005
+    score = Objective(start, goal, 'score', 0.005)
+    assert score.cost(start.points) == pytest.approx(difference_score(goal.points, start.points, 0, [0, 20]))
+    assert 100 * np.linalg.norm(score.residuals(start.points)) == pytest.approx(score.cost(start.points))
+
+
+def test_marked_points_are_the_features_of_the_score():
+    bent = np.array(straight().points)
+    bent[10:15, 1] += 0.03
+    marked = np.arange(21) == 12
+    goal = Chain(bent, features=marked)
+    score = Objective(straight(), goal, 'score', 0.005).score(straight().points)
+    assert score == pytest.approx(difference_score(bent, straight().points, 0, [12]))
+    assert score != pytest.approx(difference_score(bent, straight().points, 0, [0, 20]))
+
+
+def refined(residuals, start, iterations=5):
+    """Return the best point (d,) [m], and how many points were tried."""
+    tried = 0
+    asking = refine(Best(np.array(start), residuals(np.array(start))), lambda seen: seen, iterations)
+    points = next(asking)
+    while True:
+        tried += len(points)
+        try:
+            points = asking.send([residuals(point) for point in points])
+        except StopIteration as end:
+            return end.value.point, tried
+
+
+def test_refinement_solves_a_linear_problem_at_once():
+    matrix = np.random.default_rng(1).normal(size=(12, 3))
+    best, tried = refined(lambda point: matrix @ (point - [0.02, -0.01, 0.03]), [0.0, 0.0, 0.0], 2)
+    np.testing.assert_allclose(best, [0.02, -0.01, 0.03], atol=2e-3)
+    assert tried == 3 + 3 + 3
+
+
+def test_refinement_goes_on_where_some_points_are_impossible():
+    def half_plane(point):
+        x, y = point - [0.05, 0.02]
+        return None if x > 0.0005 else np.array([x, 2 * y, x])
+
+    best, _ = refined(half_plane, [0.045, 0.0])
+    np.testing.assert_allclose(best, [0.05, 0.02], atol=6e-3)
+
+
+def test_refinement_stays_where_nothing_is_better():
+    best, tried = refined(lambda point: np.zeros(4), [0.01, 0.02])
+    np.testing.assert_array_equal(best, [0.01, 0.02])
+    assert tried == 5
