@@ -9,15 +9,19 @@ This process never loads an engine: loading one, or compiling its kernels, would
 
 from __future__ import annotations
 
+from concurrent.futures import wait
 from contextlib import closing
 import threading
 from typing import Any, Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Rollout, Simulator
+
+PERIOD = 0.05  # s between two looks whether to wait no longer
 
 
 class PlannerProcesses:
@@ -41,23 +45,33 @@ class PlannerProcesses:
         """Begin to start processes and to load the engine in them; return at once."""
         threading.Thread(target=self._try, args=(simulation, workers), name='preparing', daemon=True).start()
 
-    def ready(self, simulation: Options, workers: int) -> ProcessExecutor:
+    def ready(self, simulation: Options, workers: int,
+              should_stop: Callable[[], bool] = lambda: False) -> ProcessExecutor:
         """
         Return the executor when its processes can simulate.
 
         :param workers: number of processes; 0: one per core.
-        :raises DloCalibrationError: if no process can be started, or the engine cannot be used.
+        :param should_stop: whether to wait no longer, e.g. for the compiler.
+        :raises DloCalibrationError: if no process can be started, or the engine cannot be used; if it
+            waits no longer.
         """
-        with self._changing:
+        while not self._changing.acquire(timeout=PERIOD):
+            _check(should_stop)
+        try:
             executor = self._started(workers or cores(), simulation.answer_limit)
             engine = f'{simulation.engine} {simulation.scene}'
             if self._engine != engine:
                 # One alone compiles the kernels, if they are not in Numba's cache; the others load them.
-                executor.submit(_load, self._make_simulator, simulation).result()
+                first = executor.submit(_load, self._make_simulator, simulation)
+                while not wait([first], PERIOD).done:
+                    _check(should_stop)
+                first.result()
                 for _ in range((workers or cores()) - 1):
                     executor.submit(_load, self._make_simulator, simulation)
                 self._engine = engine
             return executor
+        finally:
+            self._changing.release()
 
     def close(self) -> None:
         """End the processes now; what they simulate is cancelled."""
@@ -82,6 +96,11 @@ class PlannerProcesses:
             if self._closed:
                 self._executor.close()
         return self._executor
+
+
+def _check(should_stop: Callable[[], bool]) -> None:
+    if should_stop():
+        raise DloCalibrationError('it was stopped while the engine was being loaded or compiled')
 
 
 class MadeWhereUsed:

@@ -23,6 +23,7 @@ from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
 from dlo_calibration.messages.refusals import Refusals
+from dlo_calibration.planning.checks import checked
 from dlo_calibration.planning.plain import plain_plan
 from dlo_calibration.planning.plan import Plan
 from dlo_calibration.planning.planner import plan as find_plan
@@ -78,7 +79,7 @@ class Processes(Protocol):
     def prepare(self, simulation: Options, workers: int) -> None:
         """Begin to start processes; return at once."""
 
-    def ready(self, simulation: Options, workers: int) -> Any:
+    def ready(self, simulation: Options, workers: int, should_stop: Callable[[], bool]) -> Any:
         """Return the executor when its processes can simulate."""
 
     def close(self) -> None:
@@ -140,10 +141,14 @@ class PlannerSession:
         """
         self._found, self._origin = found, origin
         for problem in found.problems:
-            self.refuse(f'{origin}: {problem}')
+            self._graph.warn(f'{origin}: {problem}')
         self._graph.info(f'description from {origin}: a DLO of {found.length:.3g} m')
-        if found.refusal is None and not self.planning:
-            self._processes.prepare(found.file_options.options(), self._graph.options().workers)
+        options = self._graph.options()
+        if not self.planning:
+            try:
+                self._processes.prepare(_simulation(found, options), options.workers)
+            except InputError as error:
+                self.refuse(str(error))
         self._report()
 
     def refuse(self, text: str) -> None:
@@ -234,10 +239,12 @@ class PlannerSession:
         if goal.frame_id != start.frame_id:
             raise InputError(str(goal), f'frame_id {goal.frame_id!r}',
                              f'that of the chain, {start.frame_id!r}', 'send both in one frame')
-        options, simulation = self._graph.options(), _simulation(found)
+        options = self._graph.options()
+        simulation = _simulation(found, options)
+        checked(found, start.chain, goal.chain, simulation, options)
 
         def work(should_stop: Callable[[], bool]) -> Event:
-            executor = self._processes.ready(simulation, options.workers)
+            executor = self._processes.ready(simulation, options.workers, should_stop)
             return self._find(found, start.chain, goal.chain, options, simulation=simulation,
                               on_progress=self._background.events.put, should_stop=should_stop,
                               make_simulator=self._make_simulator, executor=executor)
@@ -325,13 +332,15 @@ class PlannerSession:
         self._graph.publish(name, self._graph.encode(name, message))
 
 
-def _simulation(found: Description) -> Options:
+def _simulation(found: Description, options: PlannerOptions) -> Options:
     """
-    Return the options with which the DLO is simulated: those of its calibration.
+    Return the options with which the DLO is simulated: those of its calibration, unless others replace them.
 
     :raises InputError: if it has a scene that cannot be used.
     """
-    if found.refusal is not None:
-        raise InputError(DESCRIPTION, f'a scene that cannot be used ({found.refusal.came})', 'one beside it',
-                         'set the parameter description to a result.xml in whose folder the scene lies')
-    return found.file_options.options()
+    replacing = options.replacing()
+    if found.refusal is not None and 'scene' not in replacing:
+        raise InputError(DESCRIPTION, f'a scene that cannot be used ({found.refusal.came})', 'one that can',
+                         "set the parameter description to a result.xml beside its scene, or 'scene=PATH' in "
+                         'the parameter simulation')
+    return Options.of({**found.options, **replacing})

@@ -4,6 +4,7 @@
 """The planner over a real graph: what robot software sees."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 import json
 import os
 import signal
@@ -19,7 +20,7 @@ from rclpy.qos import ReliabilityPolicy
 from toy_planner import CHAIN, description, NoProcesses, RESULT, ToyPlan
 
 from dlo_calibration import Chain, InputError
-from dlo_calibration.files.result import read_description, read_result
+from dlo_calibration.files.result import read_description, read_result, write_result
 from dlo_calibration.ros import planner
 from dlo_calibration.ros.planner_node import PlannerNode, spin
 
@@ -119,17 +120,16 @@ def test_a_description_from_a_file_is_published_latched_and_can_be_replaced(robo
     assert read_description(late[0].data).values == read_result(RESULT).values
     assert not node.get_subscriptions_info_by_topic('/planner/dlo_description')[1:]  # that of the robot alone
     other = tmp_path / 'other.xml'
-    text = RESULT.read_text(encoding='utf-8')
-    other.write_text(text.replace(f'length="{read_result(RESULT).length}"', 'length="0.7"'), encoding='utf-8')
+    write_result(other, replace(read_result(RESULT), length=0.61))
     refused, = node.set_parameters([Parameter('description', value=str(tmp_path / 'none.xml'))])
     assert not refused.successful and 'none.xml' in refused.reason
     assert node.options().description == str(RESULT)
     assert node.set_parameters([Parameter('description', value=str(other))])[0].successful
     robot.until(lambda: len(late) == 2)
-    assert read_description(late[1].data).length == 0.7
+    assert read_description(late[1].data).length == 0.61
     robot.send_chains()
     robot.plan()
-    assert plan.calls[0][0].length == 0.7
+    assert plan.calls[0][0].length == 0.61
 
 
 def test_a_robot_that_comes_late_gets_the_steps_and_no_old_action(robot):

@@ -14,7 +14,7 @@ from processes import children
 import pytest
 from toy_simulator import new_toy, toy_trial, ToySimulator
 
-from dlo_calibration import InputError
+from dlo_calibration import DloCalibrationError, InputError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.ros.planner_processes import MadeWhereUsed, PlannerProcesses
@@ -74,6 +74,17 @@ def test_an_engine_that_cannot_be_used_is_told_to_each_plan(kept):
     for _ in range(2):
         with pytest.raises(InputError, match='engine: got none'):
             processes.ready(Options(), 1)
+
+
+def sleep(_):
+    time.sleep(1000)
+
+
+def test_whoever_waits_for_the_compiler_can_be_stopped(kept):
+    processes = kept(sleep)
+    processes.prepare(Options(), 1)
+    with pytest.raises(DloCalibrationError, match='it was stopped while the engine was being loaded'):
+        processes.ready(Options(), 1, lambda: True)
 
 
 def test_closing_ends_the_processes_and_what_they_do(kept):

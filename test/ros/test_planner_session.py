@@ -214,10 +214,10 @@ def test_a_later_description_replaces_the_earlier_one(started):
     graph = started(plan)
     graph.send_chains()
     graph.planned()
-    other = replace(read_result(RESULT), length=0.7)
+    other = replace(read_result(RESULT), length=0.61)
     graph.hear('dlo_description', description(description_document(other).decode()))
     graph.planned()
-    assert [call[0].length for call in plan.calls] == [read_result(RESULT).length, 0.7]
+    assert [call[0].length for call in plan.calls] == [read_result(RESULT).length, 0.61]
 
 
 def test_a_scene_that_a_message_names_is_no_reason_to_plan_without_it(started):
@@ -230,6 +230,32 @@ def test_a_scene_that_a_message_names_is_no_reason_to_plan_without_it(started):
     done, answer = graph.session.request('plan')
     assert not done
     assert 'scene' in answer and 'parameter description' in answer
+
+
+def test_the_simulation_is_that_of_the_description_unless_a_parameter_replaces_it(started):
+    plan = ToyPlan()
+    graph = started(plan, simulation=['nodes=21', 'table=true', 'table_height=-0.001'])
+    graph.send_chains()
+    graph.planned()
+    recorded = read_result(RESULT).file_options.options()
+    assert plan.calls[0][-1] == replace(recorded, nodes=21, table_height=-0.001)
+
+
+@pytest.mark.parametrize('text', ['nodes', 'nodes=many', 'nodes=2', 'seed=3', 'table=yes', '=3'])
+def test_a_bad_option_of_the_simulation_is_refused(text):
+    with pytest.raises(InputError, match='parameter (simulation|nodes|table): got '):
+        PlannerOptions(simulation=(text,))
+
+
+def test_chains_that_do_not_belong_together_are_refused_in_the_answer(started):
+    graph = started()
+    graph.send_chains(CHAIN, Chain(CHAIN.points * 1000))
+    done, answer = graph.session.request('plan')
+    assert not done and answer.startswith('goal chain: got a length of ')
+    assert graph.status['last_refusal'] == answer
+    graph.send_chains(CHAIN, Chain(CHAIN.points + (0, 0, 0.5)))
+    done, answer = graph.session.request('plan')
+    assert not done and 'above the table' in answer
 
 
 @pytest.mark.parametrize('error, words', [

@@ -54,7 +54,7 @@ class NoProcesses:
     def prepare(self, simulation, workers):
         """Do nothing."""
 
-    def ready(self, simulation, workers):
+    def ready(self, simulation, workers, should_stop):
         """Return no executor."""
 
     def close(self):
