@@ -160,6 +160,9 @@ class GraphNode(OptionsNode[Chosen]):
         """Note, or tell, that a publisher cannot reach a subscription."""
         if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
             self._incompatible.add(kind)  # replaced at the next tick, as its own callback cannot destroy it
+        elif event.last_policy_kind == QoSPolicyKind.DURABILITY:
+            self.warn(f'{kind}: no messages arrive from a publisher that does not latch them; publish with '
+                      'durability transient local')
         else:
             self.warn(f'{kind}: no messages arrive from a publisher whose quality of service does not match; '
                       'publish with reliable or best-effort reliability and default deadlines')

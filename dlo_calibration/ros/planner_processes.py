@@ -9,7 +9,7 @@ This process never loads an engine: loading one, or compiling its kernels, would
 
 from __future__ import annotations
 
-from concurrent.futures import wait
+from concurrent.futures import CancelledError, wait
 from contextlib import closing
 import threading
 from typing import Any, Callable, Mapping
@@ -35,7 +35,8 @@ class PlannerProcesses:
     def __init__(self, make_simulator: SimulatorFactory, on_death: Callable[[str], None]) -> None:
         self._make_simulator = make_simulator
         self._on_death = on_death
-        self._changing = threading.Lock()
+        self._changing = threading.Lock()  # held while the engine is being loaded, too
+        self._starting = threading.Lock()
         self._executor: ProcessExecutor | None = None
         self._kept: tuple[int, float] | None = None  # number and limit that the processes have
         self._engine: str | None = None  # what they have loaded
@@ -54,6 +55,7 @@ class PlannerProcesses:
         :param should_stop: whether to wait no longer, e.g. for the compiler.
         :raises DloCalibrationError: if no process can be started, or the engine cannot be used; if it
             waits no longer.
+        :raises CancelledError: after `close`.
         """
         while not self._changing.acquire(timeout=PERIOD):
             _check(should_stop)
@@ -75,9 +77,10 @@ class PlannerProcesses:
 
     def close(self) -> None:
         """End the processes now; what they simulate is cancelled."""
-        self._closed = True
-        if self._executor is not None:
-            self._executor.close()
+        with self._starting:
+            self._closed = True
+            if self._executor is not None:
+                self._executor.close()
 
     def _try(self, simulation: Options, workers: int) -> None:
         try:
@@ -87,15 +90,16 @@ class PlannerProcesses:
 
     def _started(self, workers: int, answer_limit: float) -> ProcessExecutor:
         """Return an executor of so many processes: the present one, or a new one instead of it."""
-        if self._executor is None or self._kept != (workers, answer_limit):
-            if self._executor is not None:
-                self._executor.close()
-            self._engine = None
-            self._executor = ProcessExecutor(workers, self._on_death, answer_limit)
-            self._kept = workers, answer_limit
+        with self._starting:
             if self._closed:
-                self._executor.close()
-        return self._executor
+                raise CancelledError
+            if self._executor is None or self._kept != (workers, answer_limit):
+                if self._executor is not None:
+                    self._executor.close()
+                self._engine = None
+                self._executor = ProcessExecutor(workers, self._on_death, answer_limit)
+                self._kept = workers, answer_limit
+            return self._executor
 
 
 def _check(should_stop: Callable[[], bool]) -> None:

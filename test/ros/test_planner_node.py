@@ -68,7 +68,7 @@ def child(environment, *arguments):
 
 def test_plans_of_the_real_search_bring_the_dlo_nearer_and_ctrl_c_ends_it_while_it_plans(ros_environment):
     options = ('-p', f'description:={RESULT}', '-p', 'actions:=1', '-p', 'draws:=0', '-p', 'workers:=1',
-               '-p', 'tolerance:=0.01')
+               '-p', 'tolerance:=0.01', '-p', 'simulation:=[nodes=15, time_step=0.006]')
     along = np.linspace(0, CHAIN.length, len(CHAIN))
     arc = np.stack([np.sin(2 * along) / 2, (1 - np.cos(2 * along)) / 2, 0 * along], axis=1)
     goal = Chain(CHAIN.points[0] * (1, 1, 0) + arc + (0, 0, CHAIN.points[:, 2].mean()))
@@ -109,6 +109,12 @@ def test_a_description_that_was_latched_before_is_heard_and_none_is_published(ro
     assert node.count_publishers('/planner/dlo_description') == 1
     robot.send_chains()
     assert robot.plan()['state'] == 'done'
+
+
+def test_a_description_that_is_not_latched_is_told(robot):
+    start(robot)
+    robot.node.create_publisher(STRING, '/planner/dlo_description', 1)
+    robot.until(lambda: any('durability transient local' in one.msg for one in robot.heard['log']))
 
 
 def test_a_description_from_a_file_is_published_latched_and_can_be_replaced(robot, tmp_path):

@@ -98,6 +98,15 @@ def test_closing_ends_the_processes_and_what_they_do(kept):
         waiting.result(PATIENCE)
 
 
+def test_nothing_starts_after_closing(kept):
+    processes = kept()
+    processes.prepare(Options(), 1)
+    processes.close()
+    with pytest.raises(CancelledError):
+        processes.ready(Options(), 1)
+    assert not [line for line in children(os.getpid()).values() if 'spawn_main' in line]
+
+
 def test_a_simulator_is_made_by_the_process_that_uses_it():
     made = []
     simulator = MadeWhereUsed(lambda options: made.append(options) or ToySimulator(), Options())

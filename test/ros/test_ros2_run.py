@@ -71,13 +71,16 @@ def started(command, **arguments):
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def interrupted(command, environment, folder):
-    """Start a command; Ctrl-C when the node collects; return what it wrote, and its exit code."""
+READY = {'calibrator': 'collecting trials', 'planner': 'call ~/plan'}  # what a node says when it is
+
+
+def interrupted(command, environment, folder, node='calibrator'):
+    """Start a command; Ctrl-C when the node is ready; return what it wrote, and its exit code."""
     said = ''
     with started(command, cwd=folder, env=environment) as process:
         for line in process.stdout:
             said += line
-            if 'collecting trials' in line:
+            if READY[node] in line:
                 os.killpg(process.pid, signal.SIGINT)
         process.wait()
     return said, process.returncode
@@ -100,8 +103,20 @@ def test_calibrator_starts_and_ends_with_exit_code_0_at_ctrl_c(command, environm
     assert len(list(tmp_path.glob('dlo_session_*/*.mcap'))) == 1
 
 
-def test_launch_file_starts_the_node_and_ctrl_c_ends_it(environment, tmp_path):
-    said, code = interrupted([*ros2('launch'), NAME, 'calibrator.launch.py'], environment, tmp_path)
+def test_planner_starts_with_its_installed_parameter_file_and_ends_at_ctrl_c(environment, tmp_path):
+    pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
+    share = Path(index.get_package_share_directory(NAME))
+    command = [*directly('planner'), '--ros-args', '--params-file', share / 'config' / 'planner.yaml',
+               '-p', f'description:={share / "msg_samples" / "xml" / "dlo.xml"}']
+    said, code = interrupted(command, environment, tmp_path, 'planner')
+    assert 'a DLO of 0.602 m' in said
+    assert 'Traceback' not in said
+    assert code == 0, said
+
+
+@pytest.mark.parametrize('node', READY)
+def test_launch_file_starts_the_node_and_ctrl_c_ends_it(node, environment, tmp_path):
+    said, code = interrupted([*ros2('launch'), NAME, f'{node}.launch.py'], environment, tmp_path, node)
     assert 'finished cleanly' in said
     assert code == 0, said
 
