@@ -31,7 +31,7 @@ from dlo_calibration import Action, Chain, Hand
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.files.result import read_description
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.planning.rehearsal import COURSE_STEP, Job, rehearse, Step
+from dlo_calibration.planning.rehearsal import Job, rehearse, Step
 
 NODES, SEEN = 81, 4  # of the simulated rope; the tracker gives every fourth one
 NOISE = 0.001  # m, of the tracker
@@ -52,11 +52,11 @@ class SimulatedRobot:
 
     def __init__(self, node, found, pace):
         self.node, self.pace = node, pace
-        posterior = Posterior.of(found)
-        radius = posterior.best['self_collision']  # the rope lies that high, so it is known well enough here
-        self.physical = {**posterior.draws(1, seed=2)[0], 'self_collision': radius}
-        self.simulator = make_simulator(replace(found.file_options.options(), nodes=41)).refined()
-        self.start = Chain(arc(found.length, radius, 0.0, (0.3, 0.0)))
+        posterior, options = Posterior.of(found), found.file_options.options()
+        height = options.table_height + posterior.best['self_collision']
+        self.start = Chain(arc(found.length, height, 0.0, (0.3, 0.0)))
+        self.physical = posterior.lying(self.start, options).draws(1, seed=2)[0]
+        self.simulator = make_simulator(replace(options, nodes=NODES // 2 + 1)).refined()
         self.steps, self.points = [], self.start.points
         self.generator = np.random.default_rng(1)
         self.tracker = node.create_publisher(PointCloud2, '/planner/chain', 10)
@@ -80,9 +80,9 @@ class SimulatedRobot:
         self.steps.append(Step(Action(tuple(hands))))
         # From the very start each time, as a chain alone does not tell how much the rope is stretched.
         found = rehearse(self.simulator, Job(self.start, tuple(self.steps), self.physical, courses=True))
-        for points in (*found.courses[-1], found.chains[-1]):
-            self.points = points
-            self.rest(COURSE_STEP / self.pace)
+        course = (*found.courses[-1], found.chains[-1])
+        for self.points in course:
+            self.rest(times[-1] / self.pace / len(course))
 
     def rest(self, seconds):
         """Let the tracker go on for a while."""
