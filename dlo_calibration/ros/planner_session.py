@@ -59,6 +59,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
 }
 LARGEST_DESCRIPTION = 10**6  # bytes; a DLO of 10,000 points needs less, and it is read within 0.2 s
 PROGRESS_PERIOD = 0.1  # s between two messages; nobody reads faster
+FIRST = 'the first actions are simulated; the engine may have to be compiled before, once per machine'
 PATIENCE = 0.5  # s that closing waits for the planning thread
 
 Event = Union[PlanProgress, Notice, Plan, Failure]
@@ -251,7 +252,7 @@ class PlannerSession:
 
         self._background.join()  # it has put its last event, so it ends now
         self._background.begin(work)
-        self._state, self._detail, self._frame_id, self._under_way = PLANNING, '', start.frame_id, True
+        self._state, self._detail, self._frame_id, self._under_way = PLANNING, FIRST, start.frame_id, True
         self._plan, self._progress, self._plans = None, None, self._plans + 1
         age = self._clock() - self._chains[CHAIN].came
         return f'plan {self._plans} begins, from the {start}, which came {age:.1f} s ago, to the {goal}'
@@ -272,6 +273,7 @@ class PlannerSession:
     def _take(self, event: Event) -> None:
         if isinstance(event, PlanProgress):
             self._progress = event
+            self._detail = '' if self._detail == FIRST else self._detail
         elif isinstance(event, Notice):
             self._detail = told(event.text)
             self._graph.warn(event.text)

@@ -36,10 +36,11 @@ def robot(ros_environment):
             one.calibrator.close()
 
 
-def start(robot, plan=None, **parameters):
+def start(robot, plan=None, remapped=(), **parameters):
     """Start the node in this process, with a search that a test makes up."""
     robot.calibrator = PlannerNode(
         session={'plan': plan or ToyPlan(), 'processes': NoProcesses()}, context=robot.context,
+        cli_args=list(remapped),
         parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()])
     robot.executor.add_node(robot.calibrator)
     return robot.calibrator
@@ -100,13 +101,14 @@ def test_plans_of_the_real_search_bring_the_dlo_nearer_and_ctrl_c_ends_it_while_
         assert len(robot.heard['action']) == actions  # nobody should execute an interrupted plan
 
 
-def test_a_description_that_was_latched_before_is_heard_and_none_is_published(robot):
-    publisher = robot.node.create_publisher(STRING, '/planner/dlo_description', LATCHED)
+@pytest.mark.parametrize('topic', ['/planner/dlo_description', '/calibrator/dlo_description'])
+def test_a_description_that_was_latched_before_is_heard_and_none_is_published(robot, topic):
+    publisher = robot.node.create_publisher(STRING, topic, LATCHED)
     publisher.publish(STRING(data=description().data))
-    node = start(robot)
+    node = start(robot, remapped=('--ros-args', '-r', f'~/dlo_description:={topic}'))
     robot.matched()
     robot.until(lambda: robot.status['description'] == '~/dlo_description')
-    assert node.count_publishers('/planner/dlo_description') == 1
+    assert node.count_publishers(topic) == 1
     robot.send_chains()
     assert robot.plan()['state'] == 'done'
 

@@ -95,6 +95,14 @@ def test_the_calibrator_reads_the_published_action_as_that_of_the_plan(started):
     assert collected.grips == (hand['grip'],)
 
 
+def test_an_action_has_a_stamp_even_before_a_simulated_clock_runs(started):
+    graph = started()
+    graph.stamp = lambda: 0
+    graph.send_chains()
+    graph.planned()
+    assert read(ACTION, graph.heard['action'][0]).stamp > 0
+
+
 @pytest.mark.parametrize('changes, words', [
     ({'actions': 0, 'reached': True, 'error_before': 0.001, 'error_after': 0.001}, 'is at the goal already'),
     ({'actions': 0, 'error_after': 0.106}, 'The goal is not reached')])
@@ -123,6 +131,8 @@ def test_one_plan_at_a_time_and_stop_publishes_the_best_so_far(started):
     graph.send_chains()
     assert graph.session.request('plan')[0]
     assert graph.status['state'] == 'planning'
+    assert 'may have to be compiled' in graph.status['detail']
+    graph.until(lambda: graph.status['detail'] == '')
     done, answer = graph.session.request('plan')
     assert not done and 'a plan under way' in answer
     assert not graph.heard['action']
