@@ -124,7 +124,7 @@ def main():
 
     def told(points):
         error = np.linalg.norm(points - goal[::SEEN], axis=1).mean()
-        return f'{1e3 * error:.1f} mm ({100 * error / found.length:.1f} % of the length) from the goal'
+        return f'{1e3 * error:.1f} mm ({100 * error / found.length:.1f} % of its length) from the goal'
 
     log.info(f'the rope is {told(robot.points[::SEEN])}')
     for number in range(1, MOST_ACTIONS + 1):
@@ -141,11 +141,10 @@ def main():
             break
         wait(lambda: 'action' in heard)
         steps = json.loads(heard['steps'].data)['actions']
-        log.info(f'planned {len(steps)} action(s) in {float(status("seconds")):.1f} s; '
-                 f'action {number} is {steps[0]["name"]}, and should bring it to '
-                 f'{told(np.array(steps[0]["predicted"]))}')
+        log.info(f'action {number}: {steps[0]["name"]}, the first of {len(steps)} planned in '
+                 f'{float(status("seconds")):.1f} s; predicted: {told(np.array(steps[0]["predicted"]))}')
         robot.execute(heard['action'])
-        log.info(f'after action {number}, the rope is {told(robot.points[::SEEN])}')
+        log.info(f'action {number}: done; the rope is {told(robot.points[::SEEN])}')
     log.info(f'the planner says: {status("detail")}')
     rclpy.shutdown()
 

@@ -7,25 +7,34 @@ from dataclasses import replace
 from pathlib import Path
 import re
 
+from made_up_plan import made_up_plan
 import pytest
 
 from dlo_calibration.calibration.options import declarations
 from dlo_calibration.files.intake import OUTPUT_TYPES
+from dlo_calibration.files.result import read_result, write_result
+from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.planning.plain import plain_plan
+from dlo_calibration.ros import planner_diagnostics, planner_session
+from dlo_calibration.ros.planner_options import PlannerOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def documented():
-    """Return the cells of the table of parameters in doc/messages.md, by name."""
+def sections():
+    """Return the sections of doc/messages.md by their headings."""
     text = (ROOT / 'doc/messages.md').read_text(encoding='utf-8')
-    rows = re.findall(r'^\| `(\w+)` \| (.*?) \| (.*?) \| (.*?) \| (.*?) \|$', text, re.MULTILINE)
-    return {name: rest for name, *rest in rows}
+    return dict(part.split('\n', 1) for part in text.split('\n## ')[1:])
 
 
-def test_every_parameter_is_documented_as_it_is_declared():
-    table = documented()
-    assert list(table) == [declaration.name for declaration in declarations()]
-    for declaration in declarations():
+@pytest.mark.parametrize('heading, declared', [
+    ('Parameters', declarations()), ('The planner', PlannerOptions.declarations())],
+    ids=['calibrator', 'planner'])
+def test_every_parameter_is_documented_as_it_is_declared(heading, declared):
+    row = re.compile(r'^\| `(\w+)` \| (.*?) \| (.*?) \| (.*?) \| (.*?) \|$', re.MULTILINE)
+    table = {name: rest for name, *rest in row.findall(sections()[heading])}
+    assert list(table) == [declaration.name for declaration in declared]
+    for declaration in declared:
         default, unit, values, meaning = table[declaration.name]
         assert (unit, meaning) == (declaration.unit, declaration.description)
         shown = declaration.default
@@ -40,14 +49,32 @@ def test_every_parameter_is_documented_as_it_is_declared():
 
 
 def test_every_topic_is_documented():
-    text = (ROOT / 'doc/messages.md').read_text(encoding='utf-8')
+    planner = sections()['The planner']
+    for name in (*planner_session.INPUT_TYPES, *planner_session.OUTPUT_TYPES, 'plan', 'stop'):
+        assert f'~/{name}' in planner
+    calibrator = ''.join(text for heading, text in sections().items() if heading != 'The planner')
     for name in ('initial_chain', 'action', 'goal_chain', *OUTPUT_TYPES, 'start', 'stop', 'reset'):
-        assert f'~/{name}' in text
+        assert f'~/{name}' in calibrator
+
+
+def test_every_key_of_the_planners_status_is_documented():
+    plan = made_up_plan(read_result(ROOT / 'msg_samples/xml/dlo.xml').chain)
+    status, = planner_diagnostics.planner_status(
+        bag_types(), stamp=1, state='done', detail='', missing=(), last_refusal='', description='', plans=1,
+        plan=plan).status
+    for pair in status.values:
+        assert f'`{pair.key}`' in sections()['The planner']
+
+
+def test_every_key_of_a_plan_is_documented():
+    plan = plain_plan(made_up_plan(read_result(ROOT / 'msg_samples/xml/dlo.xml').chain))
+    for key in (*plan, *plan['actions'][0], *plan['actions'][0]['hands'][0]):
+        assert f'`{key}`' in sections()['JSON']
 
 
 @pytest.mark.parametrize('document', [
     'README.md', 'CONTRIBUTING.md', 'doc/capture.md', 'doc/guide.md', 'doc/messages.md', 'doc/formats.md',
-    'doc/physics.md', 'doc/report.md', 'doc/experiment.md', 'msg_samples/README.md',
+    'doc/physics.md', 'doc/planning.md', 'doc/report.md', 'doc/experiment.md', 'msg_samples/README.md',
     'msg_samples/photographs/README.md', 'benchmark/README.md'])
 def test_links_lead_somewhere(document):
     text = (ROOT / document).read_text(encoding='utf-8')
@@ -59,8 +86,6 @@ def test_links_lead_somewhere(document):
 def test_the_snippets_of_the_readme_work(tmp_path, capsys):
     """Execute them one after the other, on a sample and with fewer evaluations."""
     import pybullet
-
-    from dlo_calibration.files.result import write_result
 
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     sample, few = str(ROOT / 'msg_samples/object1'), "evaluations=2, nodes=12, workers=1, engine='compiled'"
