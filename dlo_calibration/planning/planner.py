@@ -69,7 +69,7 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
     start, goal = checked(found, start, goal, simulation, options)
     posterior = Posterior.of(found).lying(start, simulation)
-    tolerance = options.tolerance / 100 * found.length
+    tolerance = options.tolerance / 100 * start.length
     objective = Objective(start, goal, options.objective, tolerance)
     level = None if simulation.scene else lying_level(start, simulation.table_height)
     search = BeamSearch(start, objective, options, Limits.of(options),
