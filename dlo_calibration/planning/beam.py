@@ -21,8 +21,8 @@ from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearsal, Step
 
 WIDTH = 3  # sequences that are continued
 KEPT = 4  # moves after each sequence that are refined
-ALIKE = 0.2  # of the error; of sequences that end nearer to each other, the better one is continued
-GAIN = 0.02  # share of the cost that an action must gain
+ALIKE = 0.2  # of the cost; of sequences that end nearer to each other, the better one is continued
+PRICE = 1.08  # factor on the cost that an action must save
 NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
 PATIENCE = 1  # actions that need not gain anything, before one that may
@@ -47,7 +47,7 @@ class Course:
     A sequence of moves, and the DLO at rest before and after each.
 
     :param chains: (k + 1, n, 3) [m] with the found parameters, the first one before the first move.
-    :param cost: of the last chain.
+    :param cost: of the last chain [m].
     """
 
     moves: tuple[Move, ...]
@@ -90,7 +90,7 @@ class Judged:
     A course that was simulated at once, with the found parameters and with draws from the posterior.
 
     :param best: with the found parameters; `drawn` with the draws.
-    :param cost: mean over the draws.
+    :param cost: mean over the draws [m].
     """
 
     course: Course
@@ -109,14 +109,16 @@ class BeamSearch:
     reaches the goal are refined together.
 
     :param start: the DLO before the first move.
+    :param enough: cost [m] at which the goal counts as reached.
     :param levels: (n,) heights [m] at which the points are put down.
     :param physical: found parameters; `draws` from the posterior (SI units).
     """
 
-    def __init__(self, start: Chain, objective: Objective, options: PlanOptions, limits: Refusing,
-                 levels: Floats, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]) -> None:
+    def __init__(self, start: Chain, objective: Objective, enough: float, options: PlanOptions,
+                 limits: Refusing, levels: Floats, physical: Mapping[str, float],
+                 draws: Sequence[Mapping[str, float]]) -> None:
         self._start = start
-        self._objective, self._options, self._limits = objective, options, limits
+        self._objective, self._enough, self._options, self._limits = objective, enough, options, limits
         self._levels, self._physical, self._draws = levels, physical, draws
         self._crossings = max(crossings(start.points), crossings(objective.goal))
         self._root = Course((), start.points[None], objective.cost(start.points))
@@ -150,7 +152,7 @@ class BeamSearch:
     @property
     def reached(self) -> bool:
         """Whether the start, or the end of the best judged sequence, is within the tolerance of the goal."""
-        return self._judged_cost <= self._objective.enough
+        return not self._judged_rank[0]
 
     @property
     def expected(self) -> int:
@@ -169,12 +171,12 @@ class BeamSearch:
             return
         beam, reason, stalled = [self._root], f'the largest number of actions, {self._options.actions}', 0
         for count in range(1, self._options.actions + 1):
-            self.actions, before = count, self.best.cost
+            self.actions, before = count, min(map(self._rank_of, [self._root, *self._pool]))
             beam = yield from self._grown(beam)
             if not beam:
                 reason = 'no further action is permitted'
                 break
-            stalled = 0 if beam[0].cost < (1 - GAIN) * before else stalled + 1
+            stalled = 0 if self._rank_of(beam[0]) < before else stalled + 1
             if stalled > PATIENCE:
                 reason = 'no further action brings it nearer'
                 break
@@ -184,10 +186,18 @@ class BeamSearch:
                 break
         yield from self._conclude(reason)
 
+    def _rank(self, cost: float, actions: int) -> tuple[bool, float]:
+        """Return what is less for a better sequence: one that reaches the goal, or is worth its actions."""
+        return cost > self._enough, cost * PRICE**actions
+
+    def _rank_of(self, course: Course) -> tuple[bool, float]:
+        return self._rank(course.cost, len(course.moves))
+
     @property
-    def _judged_cost(self) -> float:
-        """Cost after the best judged sequence, or without any action."""
-        return self._root.cost if self.judged is None else self.judged.cost
+    def _judged_rank(self) -> tuple[bool, float]:
+        """Rank of the best judged sequence, or of no action."""
+        return self._rank_of(self._root) if self.judged is None else self._rank(
+            self.judged.cost, len(self.judged.steps))
 
     def _completed(self, beam: list[Course], last: bool) -> Asking[list[Course]]:
         """
@@ -196,10 +206,10 @@ class BeamSearch:
         :param last: they cannot be continued, so they are all refined and judged.
         :returns: all sequences, best first.
         """
-        near = [course for course in beam if last or course.cost < NEAR * self._objective.enough]
+        near = [course for course in beam if last or course.cost < NEAR * self._enough]
         for group in (near[:1], near[1:]):  # the others are seldom needed
             refined = yield from self._together(group)
-            yield from self._judge([one for one in refined if last or one.cost <= self._objective.enough])
+            yield from self._judge([one for one in refined if last or one.cost <= self._enough])
             beam = [*(one for one in beam if one not in group), *refined]
             if self.reached:
                 break
@@ -210,12 +220,10 @@ class BeamSearch:
     def _conclude(self, reason: str) -> Asking[None]:
         """Judge the most promising sequences so far, until one of them is permitted."""
         pool = sorted((course for course in dict.fromkeys([*self._pool, self.best])
-                       if course not in self._known and course.cost < self._judged_cost),
-                      key=lambda course: course.cost)
-        if pool:
-            yield from self._judge(pool[:1])
-        for first in range(1, len(pool), WIDTH):
-            if self.judged is None:
+                       if course not in self._known and self._rank_of(course) < self._judged_rank),
+                      key=self._rank_of)
+        for first in range(0, len(pool), WIDTH):
+            if not self.reached and (first == 0 or self.judged is None):
                 yield from self._judge(pool[first:first + WIDTH])
         self.stop_reason = reason
 
@@ -244,8 +252,8 @@ class BeamSearch:
         """Return courses, best first, without those that end almost like a better one."""
         found: list[Course] = []
         for course in courses:
-            least = ALIKE * self._objective.error(course.end)
-            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > least for other in found):
+            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * course.cost
+                   for other in found):
                 found.append(course)
         return found
 
@@ -333,5 +341,5 @@ class BeamSearch:
             if best.failure or not all(self._allowed(self._forbidden(one)) for one in (best, *drawn)):
                 continue
             cost = float(np.mean([self._objective.cost(one.chains[-1]) for one in drawn or [best]]))
-            if cost < (1 - GAIN) * self._judged_cost:
+            if self._rank(cost, len(steps)) < self._judged_rank:
                 self.judged = Judged(course, steps, best, tuple(drawn), cost)

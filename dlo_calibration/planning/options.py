@@ -27,8 +27,9 @@ class PlanOptions(DeclaredOptions):
     kinds: tuple[str, ...] = declared(KINDS, 'the kinds of actions that a plan may have', choices=KINDS,
                                       of=SEARCH)
     objective: str = declared(
-        POINTS, "what is minimised: points, the mean distance of the points from the goal; or score, the "
-        "paper's difference score, which counts orientation and facing", choices=(POINTS, SCORE), of=SEARCH)
+        POINTS, "what is minimised: points, the mean distance of the points from the goal; or score, this "
+        "distance and the paper's difference score per point, which counts orientation and facing",
+        choices=(POINTS, SCORE), of=SEARCH)
     tolerance: float = declared(
         1.0, 'the goal is reached if the mean distance of the points from it is at most this share of the '
         'length', unit='%', minimum=0.01, maximum=100.0, of=SEARCH)

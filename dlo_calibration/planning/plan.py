@@ -41,8 +41,8 @@ class Plan:
     :param error_after: of the DLO at rest after all actions [m].
     :param score_after: the paper's difference score after all actions [cm], averaged likewise; its focal
         point is the first point, its features are the marked points, or both ends if there are none.
-    :param reached: whether `error_after` is within the tolerance; if the score was minimised, whether
-        `score_after` is that of very similar chains.
+    :param reached: whether `error_after` is within the tolerance; if the score is minimised, together with
+        the score for each of its terms.
     :param tolerance: [m].
     :param rollouts: number of simulated actions.
     :param seconds: that the plan took.

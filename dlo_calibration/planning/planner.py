@@ -70,9 +70,9 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     start, goal = checked(found, start, goal, simulation, options)
     posterior = Posterior.of(found).lying(start, simulation)
     tolerance = options.tolerance / 100 * start.length
-    objective = Objective(start, goal, options.objective, tolerance)
+    objective = Objective(start, goal, options.objective)
     level = None if simulation.scene else lying_level(start, simulation.table_height)
-    search = BeamSearch(start, objective, options, Limits.of(options),
+    search = BeamSearch(start, objective, tolerance, options, Limits.of(options),
                         goal.points[:, 2] if level is None else np.full(len(start), level), posterior.best,
                         posterior.draws(options.draws, options.seed))
 

@@ -60,24 +60,24 @@ def test_moves_carry_points_to_their_places_in_the_goal():
             np.testing.assert_allclose(move.shifts, np.tile([0.1, 0.2], (len(move.grips), 1)))
 
 
-def test_residuals_are_as_long_as_the_cost():
+def test_the_cost_is_the_mean_distance():
     start, goal = straight(), Chain(straight().points + [0.01, 0.02, 0.0])
-    points = Objective(start, goal, 'points', 0.005)
+    points = Objective(start, goal, 'points')
     assert points.cost(start.points) == pytest.approx(np.hypot(0.01, 0.02)) == points.error(start.points)
-    assert points.enough == 0.005
-    score = Objective(start, goal, 'score', 0.005)
-    assert score.cost(start.points) == pytest.approx(difference_score(goal.points, start.points, 0, [0, 20]))
-    assert 100 * np.linalg.norm(score.residuals(start.points)) == pytest.approx(score.cost(start.points))
+    assert np.linalg.norm(points.residuals(start.points)) == pytest.approx(np.hypot(0.01, 0.02))
 
 
-def test_marked_points_are_the_features_of_the_score():
+def test_the_score_counts_if_asked():
     bent = np.array(straight().points)
     bent[10:15, 1] += 0.03
-    marked = np.arange(21) == 12
-    goal = Chain(bent, features=marked)
-    score = Objective(straight(), goal, 'score', 0.005).score(straight().points)
-    assert score == pytest.approx(difference_score(bent, straight().points, 0, [12]))
-    assert score != pytest.approx(difference_score(bent, straight().points, 0, [0, 20]))
+    for features, expected in ((np.zeros(21, bool), [0, 20]), (np.arange(21) == 12, [12])):
+        objective = Objective(straight(), Chain(bent, features=features), 'score')
+        score = difference_score(bent, straight().points, 0, expected)
+        assert objective.score(straight().points) == pytest.approx(score) != 0
+        distance, per_term = 0.03 * 5 / 21, score / 100 / (21 + len(expected))
+        assert objective.cost(straight().points) == pytest.approx(distance + per_term)
+        assert np.sum(objective.residuals(straight().points)**2) == pytest.approx(
+            0.03**2 * 5 / 21 + per_term**2)
 
 
 def refined(residuals, start, iterations=5):

@@ -184,7 +184,7 @@ def test_what_is_surer_is_preferred():
                   make_simulator=lambda _: SoftSimulator(unsure=True)) for draws in (0, 6)]
     assert [found.actions[0].name for found in plans] == ['drag', 'grasp_and_place']
     others = Posterior.of(unsure).draws(30, seed=77)
-    objective, errors = Objective(straight(), goal, 'points', 0.006), []
+    objective, errors = Objective(straight(), goal, 'points'), []
     for found in plans:
         jobs = [Job(straight(), (Step(found.actions[0].action),), one) for one in others]
         ends = [rehearse(SoftSimulator(unsure=True), job).chains[-1] for job in jobs]
@@ -195,8 +195,8 @@ def test_what_is_surer_is_preferred():
 def test_the_score_may_be_minimised():
     found = planned(TWO_MOVES, replace(ONE, objective='score'))
     assert found.reached
-    assert found.score_after < 50
-    assert found.actions
+    assert found.score_after < 100 * 23 * found.tolerance
+    assert len(found.actions) == 2
 
 
 def test_a_chain_of_few_points_is_enough():
