@@ -24,12 +24,13 @@ if TYPE_CHECKING:
     from dlo_calibration.model.trial import Goal, Trial
     from dlo_calibration.planning.options import PlanOptions
     from dlo_calibration.planning.planner import plan
+    from dlo_calibration.planning.prediction import simulate
     from dlo_calibration.simulation.bullet import BulletRope
 
 __all__ = [
     'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'EvaluationLog', 'Goal', 'Hand',
     'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'plan', 'read_result',
-    'read_session',
+    'read_session', 'simulate',
 ]
 
 _MODULES = {
@@ -40,6 +41,7 @@ _MODULES = {
     'calibration.calibrate': ('calibrate',),
     'planning.options': ('PlanOptions',),
     'planning.planner': ('plan',),
+    'planning.prediction': ('simulate',),
     'evaluation.log': ('EvaluationLog',),
     'files.session': ('read_session',),
     'files.result': ('read_result',),

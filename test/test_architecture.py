@@ -26,14 +26,14 @@ SHARED = ('errors', 'signals', 'writing')
 ONLY = {
     'aiohttp': ('capture/events.py', 'capture/guard.py', 'capture/server.py'),
     'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
-    'pybullet': ('simulation/bullet.py',),
+    'pybullet': ('simulation/bullet.py', 'simulation/window.py'),
     'cv2': ('capture',),
     'PIL': ('capture',),
     'numba': ('simulation/kernels.py', 'capture/path.py'),
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
-    'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py'),
+    'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py', 'simulation/window.py'),
     'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 

@@ -14,9 +14,21 @@ from dlo_calibration.calibration.declaration import OBSERVATION
 from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.errors import InputError
-from dlo_calibration.files.request import read_request, request_trials
-from dlo_calibration.files.session import Messages, read_session, Session, session_trials
+from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.files.request import (
+    read_request,
+    Request,
+    request_manipulations,
+    request_trials,
+)
+from dlo_calibration.files.session import (
+    Messages,
+    read_session,
+    Session,
+    session_manipulations,
+    session_trials,
+)
+from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
 
@@ -54,6 +66,8 @@ class Source:
         """
         if self.refusal is not None:
             raise self.refusal
+        if not self.trials and self.is_request:
+            raise DloCalibrationError(f'{self.path}: {self.refusals[0]}')
         if not self.trials:
             raise InputError(f'session {self.path}', 'no complete trial',
                              'an initial_chain, an action and a goal_chain, in the order of their stamps',
@@ -91,7 +105,58 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
     :param path: of the source; None: the one on the command line.
     :raises InputError: if it cannot be read, or an option has a bad value.
     """
-    path = chosen.session if path is None else path
+    opened = _open(chosen, note, of_result, chosen.session if path is None else path)
+    session, request, options = opened.session, opened.request, opened.options
+    trials, refusals = session_trials(session, options) if request is None else \
+        request_trials(request, options)
+    for text in (*opened.problems, *(refusals if trials or request is None else ())):
+        note(text)  # where no trial of a request can be used, `require_trials` says why
+    return Source(session, options, trials, refusals, opened.refusal)
+
+
+def read_manipulations(chosen: argparse.Namespace, note: Callable[[str], None],
+                       of_result: FileOptions) -> tuple[tuple[Manipulation, ...], Options]:
+    """
+    Read what the hands do in a session or a request, with or without goal chains, and the options to use.
+
+    The parameters are those of `read_source`.
+
+    :raises InputError: if it cannot be read, has no action, or an option has a bad value.
+    """
+    opened = _open(chosen, note, of_result, chosen.session)
+    if opened.refusal is not None:
+        raise opened.refusal
+    found, refusals = session_manipulations(opened.session, opened.options) if opened.request is None else \
+        (request_manipulations(opened.request, opened.options), ())
+    for text in (*opened.problems, *refusals, *(text for one in found for text in one.remarks)):
+        note(text)
+    if not found:
+        raise InputError(f'session {chosen.session}', 'no action that can be simulated',
+                         'an initial_chain, and an action after it',
+                         'see what it contains with dlo-calibration info')
+    return found, opened.options
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """
+    A session or a request that was read, and the options to use on it.
+
+    :param session: for a request, a session without messages.
+    :param problems: texts for the user.
+    :param refusal: see `Source`; None where a flag names a scene.
+    """
+
+    session: Session
+    request: Request | None
+    options: Options
+    problems: tuple[str, ...]
+    refusal: InputError | None
+
+
+def _open(chosen: argparse.Namespace, note: Callable[[str], None], of_result: FileOptions | None,
+          path: Path) -> _Opened:
+    """Read a session or a request, without its trials; see `read_source`."""
     request = read_request(path) if is_request(path) else None
     session = read_session(path, chosen.namespace) if request is None else \
         Session(path, Messages(), (), dict(request.options), request.problems, request.refusal)
@@ -107,12 +172,8 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
         value = options.flat()[name]
         if value != recorded.get(name, value):
             note(f'{name}: {_text(value)} instead of {_text(recorded[name])}')
-    trials, refusals = session_trials(session, options) if request is None else \
-        request_trials(request, options)
-    for text in (*problems, *refusals):
-        if text != str(refusal):
-            note(text)
-    return Source(session, options, trials, refusals, None if 'scene' in given else refusal)
+    return _Opened(session, request, options, tuple(text for text in problems if text != str(refusal)),
+                   None if 'scene' in given else refusal)
 
 
 def _text(value: Any) -> str:

@@ -77,6 +77,10 @@ class Job:
     physical: Mapping[str, float]
     courses: bool = False
 
+    def same_actions(self, other: Job) -> bool:
+        """Tell whether another job only has other parameters."""
+        return (self.start is other.start and self.steps is other.steps and self.courses == other.courses)
+
 
 def in_turn(steps: Sequence[Step], start: float = 0.0) -> tuple[Step, ...]:
     """Return steps whose actions follow one another, each PAUSE after the end of the one before."""
@@ -93,7 +97,7 @@ def rehearsed_trial(start: Chain, steps: Sequence[Step], courses: bool = False) 
         action = step.action
         if courses:
             times = _on_the_way(action)
-            names = tuple(hand.name for hand in action.hands)
+            names = (*step.held_by, *(hand.name for hand in action.hands))
             goals += [Goal(start, float(time), stable=False, held_by=names) for time in times]
         goals.append(Goal(start, action.end + REST, held_by=step.held_by))
     return Trial('rehearsal', start, tuple(step.action for step in steps), tuple(goals))
@@ -108,9 +112,14 @@ def _on_the_way(action: Action) -> Floats:
     return np.linspace(action.start, action.end, pieces + 1)[1:-1]
 
 
-def rehearse(simulator: Simulator, job: Job) -> Rehearsal:
-    """Simulate a sequence of actions; a simulation that diverges gives a rehearsal with a failure."""
-    trial = rehearsed_trial(job.start, job.steps, job.courses)
+def rehearse(simulator: Simulator, job: Job, trial: Trial | None = None) -> Rehearsal:
+    """
+    Simulate a sequence of actions; a simulation that diverges gives a rehearsal with a failure.
+
+    :param trial: that of the job; None: it is made.
+    """
+    if trial is None:
+        trial = rehearsed_trial(job.start, job.steps, job.courses)
     try:
         rollout = simulator.simulate(trial, job.physical)
     except SimulationError as error:
@@ -150,9 +159,12 @@ class Rehearser:
         """
         if self._executor is None:
             found = []
-            for job in jobs:
+            for job, before in zip(jobs, [None, *jobs], strict=False):
                 self._check()
-                found.append(rehearse(self._simulator, job))
+                # Draws of the same actions share their trial, as a simulator lays out each trial anew.
+                if before is None or not job.same_actions(before):
+                    trial = rehearsed_trial(job.start, job.steps, job.courses)
+                found.append(rehearse(self._simulator, job, trial))
         else:
             futures = [self._executor.submit(_rehearse_in_worker, self._key, self._packed, job)
                        for job in jobs]

@@ -13,10 +13,10 @@ import numpy as np
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.quantity import number
-from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.report.drawing import hand_colours, numbered, View
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
-from dlo_calibration.simulation.motion import FRAME_RATE, Motion, simulated_motion
+from dlo_calibration.simulation.motion import FRAME_RATE, hands_at, Motion, simulated_motion
 from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.writing import Attempts, whole
 
@@ -92,7 +92,7 @@ class _Scene:
         self._speed = '' if speed < 1.05 else f', {number(speed)} times as fast as in reality'
         self._colours = hand_colours([trial])
         self._moving: list[tuple[View, Any, Any, Mapping[str, Any]]] = []
-        self._tracked = any(not goal.stable for goal in trial.goals)
+        self._tracked = bool(captions.goal) and any(not goal.stable for goal in trial.goals)
         self._title = self.figure.suptitle(' ', fontweight='bold')
         axes = self.figure.subplots(1, 2)
         for one, above in zip(axes, (True, False), strict=True):
@@ -124,19 +124,12 @@ class _Scene:
     def show(self, time: float, chain: Floats, when: str) -> None:
         """Show the chain and the hands at a time of the trial [s]; `when` goes into the title."""
         self._title.set_text(as_text(f'{self._captions.title}: {when}{self._speed}'))
-        holding = {hand.name for hand in self._trial.holding(self._goal_at(time))}
-        begun = [hand for hand in self._trial.hands if hand.start <= time]
-        current = {**{hand.name: hand for hand in reversed(self._trial.hands)},
-                   **{hand.name: hand for hand in begun}}  # the latest of each name, or the first
+        current = hands_at(self._trial, time)
         seen = [goal.chain for goal in self._trial.goals if goal.time <= time] or [self._trial.initial]
         for view, measured, line, hands in self._moving:
             line.set_data(*view.flat(chain))
             if self._tracked:
                 measured.set_data(*view.flat(seen[-1].points))
-            for name, hand in current.items():
-                hands[name].set_data(*view.flat(hand.positions_at(time)))
-                hands[name].set_markerfacecolor(self._colours[name] if name in holding else 'none')
-
-    def _goal_at(self, time: float) -> Goal:
-        following = next((goal for goal in self._trial.goals if goal.time >= time), self._trial.goals[-1])
-        return Goal(self._trial.initial, time, stable=False, held_by=following.held_by)
+            for name, (position, closed) in current.items():
+                hands[name].set_data(*view.flat(position[None]))
+                hands[name].set_markerfacecolor(self._colours[name] if closed else 'none')

@@ -177,12 +177,15 @@ class View:
 
     :param above: look from above; else from the side, along the horizontal
         direction in which the trial extends least.
+    :param extent: (m, 3) [m] points that take the place of the trial's chains in that.
     """
 
-    def __init__(self, axes: Axes, trial: Trial, *, above: bool) -> None:
+    def __init__(self, axes: Axes, trial: Trial, *, above: bool, extent: Floats | None = None) -> None:
         self.axes = axes
         self.trial = trial
-        across = _horizontal_direction(trial)
+        if extent is None:
+            extent = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+        across = _horizontal_direction(extent)
         self._projection = np.array([[1.0, 0, 0], [0, 1.0, 0]] if above else [across, [0, 0, 1.0]])
         if above:
             axes.set(title='seen from above', xlabel='x [m]', ylabel='y [m]')
@@ -326,10 +329,9 @@ def _title(drawn: Drawn) -> str:
             f'{measured(errors.max, "m")} at most')
 
 
-def _horizontal_direction(trial: Trial) -> Floats:
-    """Return the horizontal unit vector (3,) along which the trial extends most."""
-    points = np.concatenate([trial.initial.points, *(goal.chain.points for goal in trial.goals)])[:, :2]
-    direction = np.linalg.eigh(np.cov(points.T))[1][:, -1]
+def _horizontal_direction(points: Floats) -> Floats:
+    """Return the horizontal unit vector (3,) along which points (m, 3) [m] extend most."""
+    direction = np.linalg.eigh(np.cov(points[:, :2].T))[1][:, -1]
     # The sign of an eigenvector is arbitrary; it is fixed so that pictures of the same trial agree.
     direction = direction * (1.0 if direction[np.argmax(np.abs(direction))] > 0 else -1.0)
     return np.array([direction[0], direction[1], 0.0])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import math
 from pathlib import Path
 import textwrap
-from typing import Mapping
+from typing import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -116,7 +116,17 @@ def _draw_action(view: View, planned: PlannedAction, colours: Mapping[str, str])
     view.draw_band(planned.lower, planned.upper, '90 % interval of its points')
     view.axes.plot(*view.flat(planned.predicted), '-', color=SIMULATED, linewidth=2.2, zorder=3,
                    label='after the action, predicted')
-    for hand in planned.action.hands:
+    draw_ways(view, planned.action.hands, colours)
+
+
+def draw_ways(view: View, hands: Sequence[Hand], colours: Mapping[str, str],
+              holding: Collection[str] = ()) -> None:
+    """
+    Draw the ways of hands, with arrows, and where they close and open.
+
+    :param holding: names of those that do not open at the end.
+    """
+    for hand in hands:
         colour, way = colours[hand.name], view.flat(hand.positions)
         moves = np.linalg.norm(np.diff(way, axis=1), axis=0) > 1e-6
         view.axes.plot(*way, '-', color=colour, linewidth=1.4, zorder=5)
@@ -124,10 +134,13 @@ def _draw_action(view: View, planned: PlannedAction, colours: Mapping[str, str])
             head, tail = ((float(x), float(y)) for x, y in way.T[[k + 1, k]])
             view.axes.annotate('', head, tail, zorder=5, arrowprops={
                 'arrowstyle': '-|>', 'color': colour, 'linewidth': 1.4, 'shrinkA': 0, 'shrinkB': 4})
-        view.axes.plot(*way[:, :1], 's', color=colour, markersize=7, linestyle='none', zorder=5,
-                       label=as_text(f'{hand.name} closes'))
-        view.axes.plot(*way[:, -1:], 's', color=colour, markerfacecolor='none', markersize=8, zorder=5,
-                       linestyle='none', label=as_text(f'{hand.name} opens'))
+        opens = hand.name not in holding
+        if moves.any() or not opens:
+            view.axes.plot(*way[:, :1], 's', color=colour, markersize=7, linestyle='none', zorder=5,
+                           label=as_text(f'{hand.name} closes'))
+        view.axes.plot(*way[:, -1:], 's', color=colour, markerfacecolor='none' if opens else colour,
+                       markersize=8, zorder=5, linestyle='none',
+                       label=as_text(f'{hand.name} opens') if opens else None)
 
 
 def _draw_goal(view: View) -> None:

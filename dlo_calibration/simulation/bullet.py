@@ -50,7 +50,7 @@ def _silence() -> Iterator[None]:
 
 
 with _silence():  # at import it prints its build time, also in the middle of a progress bar
-    import pybullet
+    import pybullet as pybullet  # so that `window` can use it
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
 
@@ -182,7 +182,7 @@ class BulletRope:
             pybullet.removeBody(body, physicsClientId=self._client)
 
 
-def _add_obstacle(client: int, obstacle: Obstacle) -> None:
+def add_obstacle(client: int, obstacle: Obstacle) -> None:
     """
     Add an obstacle to a world.
 
@@ -252,7 +252,7 @@ class BulletSimulator(Engine):
         client = pybullet.connect(pybullet.DIRECT)
         try:
             for obstacle in self._obstacles:
-                _add_obstacle(client, obstacle)
+                add_obstacle(client, obstacle)
         finally:
             pybullet.disconnect(physicsClientId=client)
 
@@ -305,7 +305,7 @@ class _World:
         pybullet.changeDynamics(self._plane, -1, lateralFriction=1.0, restitution=0.0,
                                 physicsClientId=self._client)
         for obstacle in obstacles:
-            _add_obstacle(self._client, obstacle)
+            add_obstacle(self._client, obstacle)
         self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=radius)
         self._among_obstacles = bool(obstacles)
 

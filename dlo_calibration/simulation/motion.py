@@ -10,6 +10,7 @@ from typing import Mapping
 
 import numpy as np
 
+from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.protocol import Simulator
@@ -31,6 +32,18 @@ class Motion:
     times: Floats
     chains: Floats
     ends: Floats
+
+
+def hands_at(trial: Trial, time: float) -> dict[str, tuple[Floats, bool]]:
+    """Return where each hand of a trial is at a time [s], (3,) [m], and whether it is closed, by name."""
+    following = next((goal for goal in trial.goals if goal.time >= time), trial.goals[-1])
+    holding = {hand.name for hand in trial.holding(
+        Goal(trial.initial, time, stable=False, held_by=following.held_by))}
+    current: dict[str, Hand] = {}  # the latest path of each name, or the first
+    for hand in trial.hands:
+        if hand.name not in current or hand.start <= time:
+            current[hand.name] = hand
+    return {name: (hand.positions_at(time)[0], name in holding) for name, hand in current.items()}
 
 
 def densely(trial: Trial, frames: int = MOST_FRAMES) -> Trial:

@@ -105,6 +105,27 @@ def test_a_course_misses_nothing_however_fast_the_hand_is(speed):
     np.testing.assert_allclose(course[-1, 0], step.action.hands[0].positions[-1], atol=0.0101)
 
 
+def test_a_hand_that_holds_does_so_on_the_way_of_another_one():
+    lift = LiftAndHold(point=20, height=0.1, hand='a').action(straight())
+    drag = Drag(point=0, to=(0.0, 0.1, 0.004), hand='b').action(straight())
+    steps, physical = (Step(lift, ('a',)), Step(drag, ('a',))), Posterior.of(MadeUpDlo()).best
+    without, with_courses = Rehearser(make_simulator(Options()))(
+        [Job(straight(), steps, physical, courses) for courses in (False, True)])
+    assert with_courses.courses[1][:, 20, 2].min() > 0.1
+    np.testing.assert_allclose(with_courses.chains, without.chains, atol=1e-3)
+
+
+def test_draws_of_the_same_actions_are_rehearsed_as_each_alone():
+    step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    rehearse, start, steps = Rehearser(make_simulator(Options())), straight(), (step,)
+    draws = Posterior.of(MadeUpDlo()).draws(3, 1)
+    together = rehearse([Job(start, steps, physical) for physical in draws])
+    for one, physical in zip(together, draws, strict=True):
+        alone, = rehearse([Job(straight(), (step,), physical)])
+        assert np.array_equal(one.chains, alone.chains)
+    assert not np.array_equal(together[0].chains, together[1].chains)
+
+
 def test_a_rehearsal_that_diverges_says_so():
     step = Step(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     physical = Posterior.of(MadeUpDlo()).best

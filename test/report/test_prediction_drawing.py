@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pictures and sentences of predictions show the chains, the bands and what the hands do."""
+
+from dataclasses import replace
+
+from calibrated import MadeUpDlo, straight
+import numpy as np
+from PIL import Image, ImageColor
+import pytest
+
+from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
+from dlo_calibration.planning.prediction import simulate
+from dlo_calibration.report.figure import BAND, SIMULATED
+from dlo_calibration.report.prediction_drawing import write_prediction_picture
+from dlo_calibration.report.prediction_sentences import prediction_sentences, width
+
+
+@pytest.fixture(scope='module')
+def prediction():
+    return simulate(MadeUpDlo(error=0.01), straight(), [
+        GraspAndPlace(point=0, to=(0.1, 0.2, 0.004)), LiftAndHold(point=20), Release()], draws=1)
+
+
+def picture(prediction, folder, name='trial 1'):
+    write_prediction_picture(prediction, name, folder / 'one.png')
+    return np.asarray(Image.open(folder / 'one.png').convert('RGB')).astype(int)
+
+
+def count(image, colour):
+    """Count the pixels of a colour."""
+    return int((np.abs(image - ImageColor.getrgb(colour)).sum(axis=2) < 20).sum())
+
+
+def test_chains_and_bands_are_drawn(prediction, tmp_path):
+    steps = tuple(replace(one, lower=one.chain - 1e-6, upper=one.chain + 1e-6) for one in prediction.steps)
+    with_band = picture(prediction, tmp_path)
+    without = picture(replace(prediction, steps=steps), tmp_path)
+    assert count(with_band, SIMULATED) > 2000
+    assert count(with_band, BAND) > 3 * count(without, BAND)
+
+
+def test_of_many_actions_five_are_shown(prediction, tmp_path):
+    many = replace(prediction, steps=prediction.steps[:1] * 40)
+    assert picture(many, tmp_path).shape[0] < 2.1 * picture(prediction, tmp_path).shape[0]
+
+
+def test_a_name_can_be_anything(prediction, tmp_path):
+    one = replace(prediction, steps=prediction.steps[:1])
+    assert picture(one, tmp_path, '$_{\n_').std() > 10
+
+
+def test_sentences_tell_what_is_not_as_usual(prediction):
+    restless = replace(prediction, remarks=('a remark',),
+                       steps=(replace(prediction.steps[0], settled=False),))
+    sentence, remark = prediction_sentences(restless)
+    assert sentence.endswith('; the DLO did not come to rest.') and remark == 'a remark'
+    assert f'the 90 % intervals are {width(prediction.steps[0])} wide on average' in sentence
+
+
+def test_a_hand_that_stays_on_the_table_lifts_nothing():
+    drag = simulate(MadeUpDlo(), straight(), [Drag(point=5, direction=(0, 1, 0), distance=0.1)], draws=0)
+    sentence, = prediction_sentences(drag)
+    assert 'left_hand grips at 0.25 of the length, moves it to (0.150, 0.100, 0.004) m and opens' in sentence
