@@ -44,4 +44,4 @@ def _hand(start: Chain, hand: Hand, step: PredictedStep) -> str:
 
 def _place(point: Floats) -> str:
     """Return a place (3,) [m] in words."""
-    return f'({", ".join(f"{one:.3f}" for one in point + 0.0)})'
+    return f'({", ".join(f"{one:.3f}" for one in point.round(3) + 0.0)})'  # no -0.000

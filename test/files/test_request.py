@@ -352,11 +352,14 @@ def test_request_that_cannot_be_used_takes_one_line(command, file):
 
 def test_examples_of_the_document_are_what_it_says(tmp_path):
     text = (SAMPLES.parents[1] / 'doc' / 'formats.md').read_text(encoding='utf-8')
-    described, asked, chain = re.findall('```xml\n(.*?)```', text, re.DOTALL)
+    described, asked, to_simulate, chain = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
     found = request_of(asked.encode())
     assert {getattr(action, 'name', None) for trial in found.trials for action in trial.actions} == {
         'lift_and_hold', 'release', None}
+    only, = request_of(to_simulate.encode()).trials
+    assert [step.name for step in only.manipulation().steps] == [
+        'grasp_and_place', 'lift_and_hold', 'release']
     (tmp_path / 'chain.xml').write_text(chain, encoding='utf-8')
     read = read_chain_file(tmp_path / 'chain.xml')
     assert (len(read), chain_xml(read).decode()) == (3, chain)

@@ -42,7 +42,8 @@ def world(monkeypatch):
 
 
 def places(client, bodies):
-    return np.array([pybullet.getBasePositionAndOrientation(one, physicsClientId=client)[0] for one in bodies])
+    return np.array([pybullet.getBasePositionAndOrientation(one, physicsClientId=client)[0]
+                     for one in bodies])
 
 
 def test_a_film_has_beads_that_touch_and_hands_that_open(film):
