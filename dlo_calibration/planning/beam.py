@@ -13,7 +13,7 @@ import numpy as np
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.planning.crossings import crossings
-from dlo_calibration.planning.moves import carrying, Move
+from dlo_calibration.planning.moves import carrying, clash, Move
 from dlo_calibration.planning.objective import Objective
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.refinement import Best, refine, Refinement, SHARES
@@ -302,7 +302,7 @@ class BeamSearch:
 
     def _permits(self, draft: Draft) -> bool:
         for step in self._steps(draft.moves, draft.before):
-            if not self._allowed(self._limits.refusal(step.action)):
+            if not self._allowed(self._limits.refusal(step.action) or clash(step.action)):
                 return False
         return True
 

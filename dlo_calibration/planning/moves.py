@@ -19,6 +19,7 @@ from dlo_calibration.planning.rehearsal import Step
 LIFTING = KINDS[0]  # grasp_and_place; the other kind stays on the table
 MOST_GRIPS = 11  # places along the DLO where one hand may grip; neighbours do nearly the same
 MOST_PAIRED_GRIPS = 6  # places along the DLO where two hands may grip, in pairs
+HANDS_APART = 0.04  # m between two hands, as grippers have a size
 SHORTEST_LEG = 1e-6  # m; a shorter part of a path has no duration
 
 
@@ -65,6 +66,22 @@ class Move:
         path = np.array(kept)
         return Step(Action(tuple(Hand(name, (grip,), np.array(times), path[:, k])
                                  for k, (name, grip) in enumerate(zip(self.hands, self.grips, strict=True)))))
+
+
+def clash(action: Action) -> str:
+    """
+    Say where the hands of a move are in each other's way: a phrase, empty if they are not.
+
+    :param action: its hands have waypoints at the same times, and move straight from one to the next.
+    """
+    for one, other in combinations(action.hands, 2):
+        between = other.positions - one.positions
+        leg = np.diff(between, axis=0)
+        share = -np.sum(between[:-1] * leg, axis=1) / np.maximum(np.sum(leg**2, axis=1), SHORTEST_LEG**2)
+        nearest = np.vstack([between, between[:-1] + np.clip(share, 0, 1)[:, None] * leg])
+        if np.linalg.norm(nearest, axis=1).min() < HANDS_APART:
+            return f'{one.name} and {other.name} come nearer to each other than {1e3 * HANDS_APART:.0f} mm'
+    return ''
 
 
 def grips(count: int, most: int) -> tuple[int, ...]:

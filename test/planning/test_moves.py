@@ -10,7 +10,7 @@ import pytest
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace
 from dlo_calibration.model.score import difference_score
-from dlo_calibration.planning.moves import carrying, Move
+from dlo_calibration.planning.moves import carrying, clash, Move
 from dlo_calibration.planning.objective import Objective
 from dlo_calibration.planning.refinement import Best, refine
 
@@ -37,6 +37,23 @@ def test_two_hands_arrive_together_and_the_faster_one_has_the_speed():
     np.testing.assert_array_equal(first.times, second.times)
     np.testing.assert_allclose(first.times, [0.0, 0.5, 1.5, 2.0])
     assert (first.name, second.name) == ('hand_2', 'hand_1')
+
+
+@pytest.mark.parametrize(('second', 'near'), [
+    ([-0.3, 0.02], True), ([-0.3, 0.06], False), ([-0.6, 0.0], True), ([-0.05, 0.05], False)])
+def test_hands_that_come_near_each_other_are_told(second, near):
+    start = straight().points  # the hands are 0.3 m apart
+    shifts = np.array([[0.0, 0.0], second])
+    action = Move('drag', (5, 15), ('hand_1', 'hand_2'), shifts).step(start, LEVELS, 0.05, 0.1).action
+    way = [np.linalg.norm(action.hands[0].positions_at(time) - action.hands[1].positions_at(time))
+           for time in np.linspace(0, action.end, 500)]
+    assert bool(min(way) < 0.04) is near
+    assert ('hand_1 and hand_2' in clash(action)) is near
+
+
+def test_one_hand_is_in_nobodys_way():
+    step = Move('drag', (5,), ('hand_1',), np.zeros(2)).step(straight().points, LEVELS, 0.05, 0.1)
+    assert clash(step.action) == ''
 
 
 def test_a_hand_that_stays_where_it_is_only_lifts():
