@@ -84,10 +84,11 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     with ExitStack() as stack:
         simulator = make_simulator(simulation)
         stack.callback(simulator.close)
-        if executor is None and options.workers != 1:
-            executor = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
-            stack.callback(executor.close)
-        rehearse, last = Rehearser(simulator, executor, should_stop), Rehearser(simulator, executor)
+        own = executor is None and options.workers != 1
+        if own:
+            executor = started = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
+            stack.callback(started.close)
+        rehearse, last = Rehearser(simulator, executor, should_stop, own), Rehearser(simulator, executor)
         try:
             while jobs := search.ask():
                 search.tell(rehearse(jobs))

@@ -140,14 +140,17 @@ class Rehearser:
     :param simulator: belongs to this thread; workers use copies of it.
     :param executor: None: this thread simulates.
     :param should_stop: asked often.
+    :param takes_part: this thread simulates, too, what the executor has not begun yet: its processes may
+        still be starting.
     """
 
     def __init__(self, simulator: Simulator, executor: Executor | None = None,
-                 should_stop: Callable[[], bool] = lambda: False) -> None:
+                 should_stop: Callable[[], bool] = lambda: False, takes_part: bool = False) -> None:
         self.count = 0  # simulated actions so far
         self._simulator = simulator
         self._executor = executor
         self._should_stop = should_stop
+        self._takes_part = takes_part
         self._key = uuid.uuid4().hex  # identifies this simulator in the workers
         self._packed = b'' if executor is None else pickle.dumps(simulator, pickle.HIGHEST_PROTOCOL)
 
@@ -157,24 +160,31 @@ class Rehearser:
 
         :raises CancelledError: once `should_stop` is True.
         """
-        if self._executor is None:
-            found = []
-            for job, before in zip(jobs, [None, *jobs], strict=False):
-                self._check()
-                # Draws of the same actions share their trial, as a simulator lays out each trial anew.
-                if before is None or not job.same_actions(before):
-                    trial = rehearsed_trial(job.start, job.steps, job.courses)
-                found.append(rehearse(self._simulator, job, trial))
-        else:
-            futures = [self._executor.submit(_rehearse_in_worker, self._key, self._packed, job)
-                       for job in jobs]
-            try:
-                found = [self._awaited(future) for future in futures]
-            finally:
-                for future in futures:
-                    future.cancel()
+        found = self._rehearsed_here(jobs) if self._executor is None else \
+            self._rehearsed_by(self._executor, jobs)
         self.count += sum(len(job.steps) for job in jobs)
         return found
+
+    def _rehearsed_here(self, jobs: Sequence[Job]) -> list[Rehearsal]:
+        found = []
+        for job, before in zip(jobs, [None, *jobs], strict=False):
+            self._check()
+            # Draws of the same actions share their trial, as a simulator lays out each trial anew.
+            if before is None or not job.same_actions(before):
+                trial = rehearsed_trial(job.start, job.steps, job.courses)
+            found.append(rehearse(self._simulator, job, trial))
+        return found
+
+    def _rehearsed_by(self, executor: Executor, jobs: Sequence[Job]) -> list[Rehearsal]:
+        futures = [executor.submit(_rehearse_in_worker, self._key, self._packed, job) for job in jobs]
+        own: list[Rehearsal] = []  # of the last jobs, in reverse order
+        try:
+            while self._takes_part and len(own) < len(jobs) and futures[-1 - len(own)].cancel():
+                own += self._rehearsed_here([jobs[-1 - len(own)]])
+            return [*(self._awaited(future) for future in futures[:len(jobs) - len(own)]), *own[::-1]]
+        finally:
+            for future in futures:
+                future.cancel()
 
     def _check(self) -> None:
         if self._should_stop():

@@ -3,6 +3,7 @@
 
 """Plans find known moves, keep to their limits, and do not depend on the number of workers."""
 
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 import itertools
 
@@ -21,7 +22,7 @@ from dlo_calibration.planning.objective import Objective
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.prediction import simulate
-from dlo_calibration.planning.rehearsal import in_turn, Job, rehearse, Step
+from dlo_calibration.planning.rehearsal import in_turn, Job, rehearse, Rehearser, Step
 
 DLO = MadeUpDlo()
 QUICK = Options(nodes=25, time_step=0.004)
@@ -108,6 +109,22 @@ def test_processes_find_the_same_plan_as_this_thread():
         np.testing.assert_array_equal(one.predicted, other.predicted)
         np.testing.assert_array_equal(one.lower, other.lower)
         np.testing.assert_array_equal(one.action.hands[0].positions, other.action.hands[0].positions)
+
+
+class Idle(Executor):
+    """It never begins what it is asked for."""
+
+    def submit(self, call, /, *args, **keywords):
+        """Return a future that stays open until it is cancelled."""
+        return Future()
+
+
+def test_a_thread_need_not_wait_for_processes_that_are_still_starting():
+    job = [Job(straight(), (Step(one.action),), {}) for one in planned(TWO_MOVES).actions]
+    alone, first = Rehearser(SoftSimulator()), Rehearser(SoftSimulator(), Idle(), takes_part=True)
+    for one, other in zip(alone(job), first(job), strict=True):
+        np.testing.assert_array_equal(one.chains, other.chains)
+    assert alone.count == first.count == 2
 
 
 def test_a_stopped_plan_is_the_best_so_far():
