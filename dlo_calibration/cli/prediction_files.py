@@ -19,14 +19,12 @@ ALL = 'simulation.json'
 
 
 def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Prediction]],
-                           about: Mapping[str, Any], simulator: Simulator,
-                           physical: Mapping[str, float]) -> None:
+                           about: Mapping[str, Any], simulator: Simulator) -> None:
     """
     Write predictions to a folder, as far as possible.
 
     :param predictions: names of trials, which can be anything, and what happens in them.
     :param about: the same, as plain values.
-    :param physical: parameters by name (SI units).
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
     from dlo_calibration.report.prediction_drawing import (
@@ -46,5 +44,5 @@ def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Predic
         with attempts.attempt(f'trial_{k}.png'):
             write_prediction_picture(one, name, folder / f'trial_{k}.png')
         with attempts.attempt(f'trial_{k}.gif'):
-            write_prediction_animation(one, name, simulator, physical, folder / f'trial_{k}.gif')
+            write_prediction_animation(one, name, simulator, folder / f'trial_{k}.gif')
     attempts.require()

@@ -23,7 +23,6 @@ from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.observation.table import resting_level
 from dlo_calibration.planning.course import simulated_course
-from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.planning.plain import plain_prediction
 from dlo_calibration.planning.prediction import DRAWS, Prediction, simulate
 from dlo_calibration.simulation.protocol import Simulator
@@ -68,15 +67,14 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     with closing(make_simulator(options)) as simulator:
         about = {**_plain(predictions), 'draws': chosen.draws, 'seed': chosen.seed, 'engine': simulator.name,
                  'seconds': time.monotonic() - begun}
-        physical = Posterior.of(found).best
         try:
             if chosen.output is not None:
-                write_prediction_files(chosen.output, predictions, about, simulator, physical)
+                write_prediction_files(chosen.output, predictions, about, simulator)
                 tell(f'the predictions are in {chosen.output}')
         finally:  # whatever the disk does
             _print(predictions, about, chosen.json)
         if chosen.gui:
-            _show(predictions, options, simulator, physical)
+            _show(predictions, options, simulator)
     return 0
 
 
@@ -118,7 +116,7 @@ def _print(predictions: Named, about: Mapping[str, Any], as_json: bool) -> None:
                 out.print(escape(sentence))
 
 
-def _show(predictions: Named, options: Options, simulator: Simulator, physical: Mapping[str, float]) -> None:
+def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
     """
     Show the motions in a window until the user closes it.
 
@@ -127,10 +125,10 @@ def _show(predictions: Named, options: Options, simulator: Simulator, physical: 
     from dlo_calibration.report.drawing import hand_colours
     from dlo_calibration.simulation.window import Film, FRAME_RATE, MOST_FRAMES, show
 
-    radius, films, levels = physical['self_collision'], [], []
+    radius, films, levels = predictions[0][1].physical['self_collision'], [], []
     for name, one in predictions:
-        trial, motion = simulated_course(one.start, [step.step for step in one.steps], simulator, physical,
-                                         frame_rate=FRAME_RATE, most=MOST_FRAMES)
+        trial, motion = simulated_course(one.start, [step.step for step in one.steps], simulator,
+                                         one.physical, frame_rate=FRAME_RATE, most=MOST_FRAMES)
         films.append(Film.of(name, trial, motion, hand_colours([trial]), radius))
         levels.append(resting_level(trial, options.table_height))
     known = [level - radius for level in levels if level is not None]

@@ -25,9 +25,14 @@ def noise(trials: Sequence[Trial]) -> float:
     nan where no chain has five points.  Noise that is correlated between neighbouring
     points, as of a tracker that fits a smooth curve, is not seen.
     """
+    return noise_of([np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+                     for trial in trials])
+
+
+def noise_of(observed: Sequence[Floats]) -> float:
+    """Return what `noise` does, from the chains of each trial: (g, n, 3) [m], same material points."""
     rows: dict[int, list[Floats]] = {}
-    for trial in trials:
-        chains = np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+    for chains in observed:
         steps = np.linalg.norm(np.diff(chains, axis=1), axis=2).mean(axis=0)
         # The mean noise along the DLO went into the arc lengths, so it is missing in the differences.
         seen = 3 - 1 / len(chains)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Callable, Sequence, Union
+from types import MappingProxyType
+from typing import Callable, Mapping, Sequence, Union
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.manipulation import PATHS, Together
 from dlo_calibration.model.named_actions import NamedAction
+from dlo_calibration.observation.noise import NO_NOISE, noise_of
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
 from dlo_calibration.planning.rehearsal import in_turn, Job, PAUSE, Rehearsal, Rehearser, Step
+from dlo_calibration.simulation.protocol import Simulator
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
 INTERVAL = (5.0, 95.0)  # %
@@ -54,13 +57,18 @@ class Prediction:
     What happens to a DLO in a sequence of actions.
 
     :param draws: number of draws from the posterior that were simulated, besides the found parameters.
+    :param physical: the found parameters by name (SI units), as they were simulated.
     :param remarks: sentences for the user, such as a draw that could not be simulated.
     """
 
     start: Chain
     steps: tuple[PredictedStep, ...]
     draws: int
+    physical: Mapping[str, float]
     remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'physical', MappingProxyType(dict(self.physical)))
 
 
 def simulate(found: CalibratedDlo, chain: Chain,
@@ -72,6 +80,7 @@ def simulate(found: CalibratedDlo, chain: Chain,
 
     A named action begins where the DLO is predicted to be with the found parameters; the hands
     then take the same paths for every draw.  Actions follow one another when the DLO is at rest.
+    Each draw also has another start, as the noise of the given one moves what is predicted.
 
     :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param chain: the DLO before the first action.
@@ -93,33 +102,59 @@ def simulate(found: CalibratedDlo, chain: Chain,
     with closing(make_simulator(options)) as simulator:
         rehearse = Rehearser(simulator, should_stop=should_stop)
         steps, best = _steps(rehearse, chain, actions, posterior.best)
-        drawn = rehearse([Job(chain, steps, physical) for physical in posterior.draws(draws, seed)])
+        drawn = rehearse([Job(start, steps, physical) for start, physical in zip(
+            _starts(chain, draws, seed), posterior.draws(draws, seed), strict=True)])
+        finer = _finer(simulator, Job(chain, steps, posterior.best), should_stop)
     failures = [one.failure for one in drawn if one.failure]
     remarks = () if not failures else (
         f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
     lower, upper = intervals(best.chains, [one.chains for one in drawn if not one.failure],
-                             found.errors.rms / np.sqrt(3))
+                             found.errors.rms / np.sqrt(3), finer)
     return Prediction(
         chain, tuple(PredictedStep(_name(action), step, frozen_array(best.chains[k]), frozen_array(lower[k]),
                                    frozen_array(upper[k]), best.settled[k])
-                     for k, (action, step) in enumerate(zip(actions, steps, strict=True))), draws, remarks)
+                     for k, (action, step) in enumerate(zip(actions, steps, strict=True))),
+        draws, posterior.best, remarks)
 
 
-def intervals(best: Floats, drawn: Sequence[Floats], error: float) -> tuple[Floats, Floats]:
+def intervals(best: Floats, drawn: Sequence[Floats], error: float,
+              finer: Floats | None = None) -> tuple[Floats, Floats]:
     """
     Return the lower and upper ends of the 90 % intervals of predicted coordinates, both like `best`.
 
-    They contain the spread of the draws, and the error that the calibration left: noise, and what the
-    model cannot represent.  The two are independent, so their half widths add as squares.
+    They contain the spread of the draws, the error that the calibration left (noise, and what the model
+    cannot represent), and the difference to a finer simulation.  These are independent, so their half
+    widths add as squares.
 
     :param best: (..., 3) [m] with the found parameters.
     :param drawn: the same with draws from the posterior.
     :param error: standard deviation of one coordinate that the calibration left [m].
+    :param finer: like `best`, from a finer simulation; None: there is none.
     """
     everything = np.stack([best, *drawn])
     below, above = best - np.percentile(everything, INTERVAL, axis=0)
-    left = (Z90 * error)**2
+    left = (Z90 * error)**2 + (0.0 if finer is None else (finer - best)**2)
     return (best - np.sqrt(np.maximum(below, 0)**2 + left), best + np.sqrt(np.minimum(above, 0)**2 + left))
+
+
+def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
+    """Return a start for each draw: the measured chain with as much noise again as it has."""
+    level = noise_of([chain.points[None]])
+    if not level > NO_NOISE:  # nan, too
+        return [chain] * draws
+    generator = np.random.default_rng([seed, 1])  # `Posterior.draws` uses the seed itself
+    return [replace(chain, points=chain.points + level * generator.standard_normal(chain.points.shape))
+            for _ in range(draws)]
+
+
+def _finer(simulator: Simulator, job: Job, should_stop: Callable[[], bool]) -> Floats | None:
+    """Return the chains after each action by a finer simulation; None if there is none."""
+    refined = simulator.refined()
+    if refined is None:
+        return None
+    with closing(refined):
+        found, = Rehearser(refined, should_stop=should_stop)([job])
+    return None if found.failure else found.chains
 
 
 def _steps(rehearse: Rehearser, chain: Chain, actions: Sequence[Doing],

@@ -63,16 +63,15 @@ def write_prediction_picture(prediction: Prediction, name: str, path: str | Path
 
 
 def write_prediction_animation(prediction: Prediction, name: str, simulator: Simulator,
-                               physical: Mapping[str, float], path: str | Path) -> None:
+                               path: str | Path) -> None:
     """
     Simulate the actions of a prediction again, and write their motion as a GIF.
 
-    :param physical: parameters by name (SI units).
     :raises InputError: if the file cannot be written.
     :raises SimulationError: if the simulation diverges.
     """
     trial, motion = simulated_course(prediction.start, [one.step for one in prediction.steps], simulator,
-                                     physical, most=MOST_FRAMES)
+                                     prediction.physical, most=MOST_FRAMES)
     write_animation(trial, motion, path, Captions(f'{name}, simulated', 'start', ''))
 
 

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from toy_simulator import ToySimulator
 
-from dlo_calibration import InputError, Options
+from dlo_calibration import calibrate, Chain, InputError, Options, read_session
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import session_trials
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
 from dlo_calibration.planning import Job, Posterior, Rehearser, Step
 from dlo_calibration.planning.prediction import intervals, simulate
@@ -69,6 +71,36 @@ def test_intervals_hold_90_percent_of_normal_errors():
     lower, upper = intervals(best, drawn, 1e-3)
     seen = generator.normal(0, 2e-3, (50, 1, 1)) + generator.normal(0, 1e-3, best.shape)
     assert np.mean((lower < seen) & (seen < upper)) == pytest.approx(0.9, abs=0.05)
+
+
+def test_the_noise_of_the_start_makes_the_interval_wide():
+    lift, exact = LiftAndHold(point=20), straight()
+    noisy = Chain(exact.points + np.random.default_rng(1).normal(0, 1e-3, exact.points.shape))
+    widths = [float((step.upper - step.lower)[:10, 1].mean()) for start in (exact, noisy)
+              for step in simulate(MadeUpDlo(), start, [lift]).steps]
+    assert 3e-4 < widths[1] and widths[0] < widths[1] / 10
+
+
+def test_a_finer_simulation_tells_how_rough_the_usual_one_is():
+    place = GraspAndPlace(point=0, to=(0.1, 0.2, 0.004))
+    coarse, usual = (simulate(MadeUpDlo(), straight(), [place], draws=0,
+                              options=Options(nodes=nodes)).steps[0] for nodes in (15, 41))
+    for step in (coarse, usual):
+        assert (step.lower <= usual.chain + 1e-3).all() and (usual.chain - 1e-3 <= step.upper).all()
+    assert (coarse.upper - coarse.lower).mean() > 2 * (usual.upper - usual.lower).mean()
+
+
+def test_90_percent_of_the_points_of_a_trial_that_was_left_out_are_in_their_intervals():
+    options = Options.of({'mass': 0.03, 'calibrate': ['flexibility', 'friction'], 'workers': 1})
+    trials, _ = session_trials(read_session(samples() / 'object1'), options)
+    inside = []
+    for k in (1, 2):
+        found = calibrate([one for one in trials if one is not trials[k]], options)
+        goal, = trials[k].goals
+        step, = simulate(found, trials[k].initial, [Step(trials[k].actions[0], goal.held_by)]).steps
+        inside.append((step.lower <= goal.chain.points) & (goal.chain.points <= step.upper))
+        assert (step.upper - step.lower).mean() < 0.007  # of a rope of 60 cm, seen with a noise of 1 mm
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.06)
 
 
 def test_the_same_seed_gives_the_same_prediction():

@@ -34,16 +34,17 @@ def count(image, colour):
 
 
 def test_chains_and_bands_are_drawn(prediction, tmp_path):
-    steps = tuple(replace(one, lower=one.chain - 1e-6, upper=one.chain + 1e-6) for one in prediction.steps)
-    with_band = picture(prediction, tmp_path)
-    without = picture(replace(prediction, steps=steps), tmp_path)
-    assert count(with_band, SIMULATED) > 2000
+    step = prediction.steps[0]
+    thin = replace(step, lower=step.chain - 1e-6, upper=step.chain + 1e-6)
+    with_band, without = (picture(replace(prediction, steps=(one,)), tmp_path) for one in (step, thin))
+    assert count(with_band, SIMULATED) > 500
     assert count(with_band, BAND) > 3 * count(without, BAND)
 
 
 def test_of_many_actions_five_are_shown(prediction, tmp_path):
     many = replace(prediction, steps=prediction.steps[:1] * 40)
-    assert picture(many, tmp_path).shape[0] < 2.1 * picture(prediction, tmp_path).shape[0]
+    one = replace(prediction, steps=prediction.steps[:1])
+    assert picture(many, tmp_path).shape[0] < 5 * picture(one, tmp_path).shape[0]
 
 
 def test_a_name_can_be_anything(prediction, tmp_path):
