@@ -127,10 +127,14 @@ class _Stage:
 
     def __init__(self, client: int, films: Sequence[Film], radius: float, table: float | None) -> None:
         self._client = client
-        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
         low, high = _ends(films)
         self._extent = max(0.1, float((high - low).max()))
         self._place = np.array([*(low + high)[:2] / 2, low[2] if table is None else table])
+        # While nothing is drawn, bodies are made much faster.
+        for what in (pybullet.COV_ENABLE_GUI, pybullet.COV_ENABLE_RENDERING):
+            pybullet.configureDebugVisualizer(what, 0, physicsClientId=client)
+        pybullet.resetDebugVisualizerCamera(self._extent, 0, -50, self._place.tolist(),
+                                            physicsClientId=client)
         if table is not None:
             half = 0.75 * self._extent
             self._bodies([self._place - (0, 0, 0.005)], TABLE_COLOUR, pybullet.GEOM_BOX,
@@ -140,8 +144,7 @@ class _Stage:
         self._hands = self._bodies(np.zeros((max(len(film.hands) for film in films), 3)), TABLE_COLOUR,
                                    pybullet.GEOM_BOX, halfExtents=[HAND] * 3)
         self._name = -1
-        pybullet.resetDebugVisualizerCamera(self._extent, 0, -50, self._place.tolist(),
-                                            physicsClientId=client)
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_RENDERING, 1, physicsClientId=client)
 
     def _bodies(self, places: Sequence[Floats] | Floats, colour: Sequence[float], kind: int,
                 **sizes: object) -> Sequence[int]:
