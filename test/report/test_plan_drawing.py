@@ -6,36 +6,19 @@
 from dataclasses import replace
 
 from calibrated import MadeUpDlo, straight
+from made_up_plan import made_up_plan, MOVES
 import numpy as np
 from PIL import Image, ImageColor
 import pytest
 from toy_simulator import ToySimulator
 
 from dlo_calibration import Chain, InputError
-from dlo_calibration.model.named_actions import Drag, GraspAndPlace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.report.drawing import View
 from dlo_calibration.report.figure import BAND, blank_figure, SIMULATED
 from dlo_calibration.report.plan_drawing import plan_trial, write_plan_animation, write_plan_picture
 from dlo_calibration.report.plan_sentences import plan_sentences
-
-START = straight()
-AFTER = [START.points + (0.0, 0.05, 0.0), START.points + (0.0, 0.1, 0.0)]
-MOVES = [GraspAndPlace(start=0.0, point=7, to=(0.31, 0.12, 0.004), hand='hand_1'),
-         Drag(start=0.0, point=0, to=(0.0, 0.1, 0.004), hand='hand_2')]
-
-
-def made_up_plan(actions=2, **changes):
-    """Return a plan whose last action ends 6 mm from its goal."""
-    done = tuple(PlannedAction(move.name, move.action(Chain(before)), after, after - 0.01, after + 0.01)
-                 for move, before, after in zip(MOVES, [START.points, *AFTER], AFTER, strict=False))
-    return Plan(**{**{
-        'start': START, 'goal': Chain(AFTER[-1] + (0.0, 0.006, 0.0)), 'actions': done[:actions],
-        'error_before': 0.106, 'error_after': 0.007, 'score_after': 31.0, 'reached': False,
-        'tolerance': 0.006, 'rollouts': 100, 'seconds': 1.0, 'seed': 1, 'stop_reason': 'made up'},
-        **changes})
 
 
 def pixels(plan, path):
@@ -48,7 +31,7 @@ def of_colour(image, colour):
 
 
 def test_a_picture_has_a_panel_for_each_action(tmp_path):
-    none, one, two = (pixels(made_up_plan(actions), tmp_path / 'plan.png') for actions in range(3))
+    none, one, two = (pixels(made_up_plan(actions=actions), tmp_path / 'plan.png') for actions in range(3))
     assert two.shape[1] > 1.4 * one.shape[1]
     assert of_colour(none, SIMULATED) == 0 < of_colour(one, SIMULATED) < of_colour(two, SIMULATED)
     assert of_colour(none, BAND) == 0 < min(of_colour(one, BAND), of_colour(two[:, :550], BAND),
@@ -64,7 +47,7 @@ def test_the_band_covers_what_its_intervals_sweep_and_nothing_else():
     chain = np.array([[0.0, 0.0, 0.0], [0.3, 0.1, 0.0], [0.2, 0.4, 0.0]])
     lower, upper = chain - [[0.02], [0.05], [0.01]], chain + [[0.02], [0.05], [0.03]]
     axes = blank_figure(4, 4).subplots()
-    move = MOVES[0].action(START)
+    move = MOVES[0].action(straight())
     View(axes, Trial('t', Chain(chain), (replace(move, hands=(replace(move.hands[0], grips=(0,)),)),),
                      (Goal(Chain(chain), 99.0),)), above=True).draw_band(lower, upper, 'band')
     pieces, = axes.collections
@@ -92,7 +75,7 @@ def test_an_animation_moves_from_the_start(tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.simulation.motion.FRAME_RATE', 1)
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 1)
     monkeypatch.setattr('dlo_calibration.report.animation.DOTS_PER_INCH', 40)
-    write_plan_animation(made_up_plan(goal=START), ToySimulator(), Posterior.of(MadeUpDlo()).best,
+    write_plan_animation(made_up_plan(goal=straight()), ToySimulator(), Posterior.of(MadeUpDlo()).best,
                          tmp_path / 'plan.gif')
     assert Image.open(tmp_path / 'plan.gif').n_frames > 5
 

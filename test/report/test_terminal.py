@@ -5,7 +5,8 @@
 
 import io
 
-from dlo_calibration.report.terminal import SearchBar
+from dlo_calibration.planning.planner import PlanProgress
+from dlo_calibration.report.terminal import PlanBar, SearchBar
 
 
 class Terminal(io.StringIO):
@@ -28,3 +29,13 @@ def test_what_a_log_answers_tells_no_time_left(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm')
     assert '-:--:--' not in last_line(0)
     assert '-:--:--' in last_line(8)
+
+
+def test_a_plan_shows_how_near_it_is_and_the_time_left(monkeypatch):
+    monkeypatch.setenv('TERM', 'xterm')
+    stream, quiet = Terminal(), Terminal()
+    for target, shown in ((stream, True), (quiet, False)):
+        with PlanBar(target, shown) as bar:
+            bar.take(PlanProgress(actions=2, rollouts=100, expected=400, best_error=0.012, seconds_left=7.4))
+    assert all(words in stream.getvalue() for words in ('planning action 2', '100/400', '12 mm', '7 s left'))
+    assert quiet.getvalue() == ''
