@@ -36,6 +36,11 @@ class Reality:
         self._simulator = simulator
         self._steps: list[Step] = []
 
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """What the hands really did so far."""
+        return tuple(self._steps)
+
     def act(self, action: Action) -> bool:
         """
         Execute an action, after which all hands open; tell whether every hand gripped the DLO.
