@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, BinaryIO, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -52,8 +52,8 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path,
     captions = captions or Captions(f'{trial.name}, simulated')
     writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': captions.title})
     with whole(Path(path)) as new, settings():
-        scene = _Scene(trial, motion, speed, captions)
-        with writer.saving(scene.figure, str(new), dpi=DOTS_PER_INCH):
+        scene: Any = _Scene(trial, motion, speed, captions)
+        with writer.saving(scene, str(new), dpi=DOTS_PER_INCH):
             for time, chain in zip(motion.times, motion.chains, strict=True):
                 scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
                 writer.grab_frame()
@@ -83,23 +83,51 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
 
 
 class _Scene:
-    """A figure in which only the simulated chain and the hands move."""
+    """
+    A figure in which only the simulated chain and the hands move.
+
+    To a writer, it is a figure.  What does not move is drawn once, as that takes most of the time.
+    """
 
     def __init__(self, trial: Trial, motion: Motion, speed: float, captions: Captions) -> None:
-        self.figure = blank_figure(10.5, 4.8)
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        self._figure = blank_figure(10.5, 4.8)
+        self._figure.set_dpi(DOTS_PER_INCH)
         self._trial = trial
         self._captions = captions
         self._speed = '' if speed < 1.05 else f', {number(speed)} times as fast as in reality'
         self._colours = hand_colours([trial])
         self._moving: list[tuple[View, Any, Any, Mapping[str, Any]]] = []
         self._tracked = bool(captions.goal) and any(not goal.stable for goal in trial.goals)
-        self._title = self.figure.suptitle(' ', fontweight='bold')
-        axes = self.figure.subplots(1, 2)
+        self._title = self._figure.suptitle(' ', fontweight='bold')
+        axes = self._figure.subplots(1, 2)
         for one, above in zip(axes, (True, False), strict=True):
             self._moving.append(self._prepare(View(one, trial, above=above), motion))
-        add_legend(self.figure, list(axes), columns=3)
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine('none')  # a new layout for each frame would move the axes
+        add_legend(self._figure, list(axes), columns=3)
+        for artist in self._artists():
+            artist.set_animated(True)  # so that `draw` leaves it out
+        canvas: Any = FigureCanvasAgg  # its methods have no types
+        self._canvas = canvas(self._figure)
+        self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def get_size_inches(self) -> Floats:
+        """Return width and height [in]."""
+        return np.asarray(self._figure.get_size_inches())
+
+    def savefig(self, target: BinaryIO, **_: Any) -> None:
+        """Write the pixels of what is shown."""
+        self._canvas.restore_region(self._still)
+        for artist in self._artists():
+            self._figure.draw_artist(artist)
+        target.write(bytes(self._canvas.buffer_rgba()))
+
+    def _artists(self) -> Iterator[Any]:
+        """Yield what moves, in the order in which it is drawn."""
+        yield self._title
+        for _, measured, line, hands in self._moving:
+            yield from (measured, line, *hands.values())
 
     def _prepare(self, view: View, motion: Motion) -> tuple[View, Any, Any, Mapping[str, Any]]:
         view.draw_start(self._captions.start)
