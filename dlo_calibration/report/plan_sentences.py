@@ -17,11 +17,17 @@ FLAT = 1e-3  # m; a hand that rises by less stays on the table
 
 
 def plan_sentences(plan: Plan) -> list[str]:
-    """Return a sentence for each action, whether they reach the goal, and the remarks."""
+    """Return sentences on each action, on whether they reach the goal or why the search ended, and remarks."""
     steps = [f'{k}. {one.name}: {"; ".join(_hand(plan, hand) for hand in one.action.hands)}; then the points '
              f'are {distance(plan, one.predicted)} from the goal on average.'
              for k, one in enumerate(plan.actions, start=1)]
-    return [*steps, outcome(plan), *plan.remarks]
+    ended = [] if plan.reached else [f'The search ended: {plan.stop_reason}.']
+    return [*steps, outcome(plan), *ended, *map(_sentence, plan.remarks)]
+
+
+def _sentence(words: str) -> str:
+    """Return words that begin with a capital letter and end with a full stop."""
+    return f'{words[:1].upper()}{words[1:].removesuffix(".")}.'
 
 
 def distance(plan: Plan, points: Floats) -> str:

@@ -114,9 +114,9 @@ class PlanBar:
     def __init__(self, stream: TextIO, shown: bool = True) -> None:
         self._progress = Progress(
             TextColumn('planning action {task.fields[action]}'), BarColumn(), MofNCompleteColumn(),
-            TextColumn('best error {task.fields[best]}, at most {task.fields[left]} s left'),
+            TextColumn('{task.fields[how]}'),
             console=console(stream), disable=not (shown and stream.isatty()))
-        self._task = self._progress.add_task('', total=None, action=1, best='-', left='-')
+        self._task = self._progress.add_task('', total=None, action=1, how='starting')
 
     def __enter__(self) -> PlanBar:
         """Show it."""
@@ -129,9 +129,9 @@ class PlanBar:
 
     def take(self, progress: PlanProgress) -> None:
         """Show how far the plan is."""
-        self._progress.update(
-            self._task, completed=progress.rollouts, total=progress.expected, action=progress.actions,
-            best=measured(progress.best_error, 'm'), left=f'{progress.seconds_left:.0f}')
+        how = f'best error {measured(progress.best_error, "m")}, at most {progress.seconds_left:.0f} s left'
+        self._progress.update(self._task, completed=progress.rollouts, total=progress.expected,
+                              action=progress.actions, how=how)
 
 
 def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:

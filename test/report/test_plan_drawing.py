@@ -81,7 +81,7 @@ def test_an_animation_moves_from_the_start(tmp_path, monkeypatch):
 
 
 def test_sentences_say_what_each_hand_does_and_how_near_the_dlo_gets():
-    first, second, end = plan_sentences(made_up_plan())
+    first, second, end, _ = plan_sentences(made_up_plan())
     assert first == ('1. grasp_and_place: hand_1 grips at 0.35 of the length, lifts 5 cm, carries it to '
                      '(0.310, 0.120) m and opens; then the points are 56 mm (9.33 %) from the goal on '
                      'average.')
@@ -96,9 +96,13 @@ def test_sentences_say_what_each_hand_does_and_how_near_the_dlo_gets():
     ({'reached': True, 'error_before': 0.005, 'actions': 0}, 'The DLO is at the goal already: 5 mm'),
     ({'reached': False, 'error_after': 0.106, 'actions': 0}, 'The goal is not reached: with 0 actions, '),
 ])
-def test_the_last_sentence_is_about_the_goal(changes, words):
-    assert plan_sentences(made_up_plan(**changes))[-1].startswith(words)
+def test_after_the_actions_a_sentence_is_about_the_goal(changes, words):
+    assert plan_sentences(made_up_plan(**changes))[changes['actions']].startswith(words)
 
 
 def test_remarks_are_told_last():
-    assert plan_sentences(made_up_plan(remarks=('The goal is longer.',)))[-1] == 'The goal is longer.'
+    assert plan_sentences(made_up_plan(remarks=('the goal is longer',)))[-1] == 'The goal is longer.'
+
+
+def test_a_goal_that_is_not_reached_is_told_with_the_reason_why_the_search_ended():
+    assert 'The search ended: stopped.' in plan_sentences(made_up_plan(stop_reason='stopped'))[-1]
