@@ -8,9 +8,11 @@ from pathlib import Path
 import re
 
 from made_up_plan import made_up_plan
+import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import declarations
+from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.messages.codec import bag_types
@@ -112,3 +114,19 @@ def test_the_snippets_of_the_readme_work(tmp_path, capsys):
     rope = names['rope']
     expected = points[:, 2].mean() - 9.81 * rope.time_step**2
     assert rope.points[:, 2].mean() == pytest.approx(expected, abs=3e-4)
+
+
+def test_the_snippet_about_planning_works(capsys):
+    """Execute it on a sample, with a shorter search."""
+    text = (ROOT / 'doc/planning.md').read_text(encoding='utf-8')
+    for written, tried in (("'result.xml'", repr(str(ROOT / 'msg_samples/xml/dlo.xml'))),
+                           ('actions=3', 'actions=1, draws=0, workers=1')):
+        assert written in text
+        text = text.replace(written, tried)
+    snippet, = re.findall('```python\n(.*?)```', text, re.DOTALL)
+    names = {name: read_chain_file(ROOT / f'msg_samples/chains/{name}.csv').points
+             for name in ('start', 'goal')}
+    exec(snippet, names)
+    assert capsys.readouterr().out.startswith('False')  # one action is not enough
+    planned, = names['planned'].actions
+    np.testing.assert_allclose(names['prediction'].steps[-1].chain, planned.predicted, atol=1e-3)
