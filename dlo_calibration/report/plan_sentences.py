@@ -17,7 +17,7 @@ FLAT = 1e-3  # m; a hand that rises by less stays on the table
 
 
 def plan_sentences(plan: Plan) -> list[str]:
-    """Return sentences on each action, on whether they reach the goal or why the search ended, and remarks."""
+    """Return sentences on the actions, whether they reach the goal or why the search ended, and remarks."""
     steps = [f'{k}. {one.name}: {"; ".join(_hand(plan, hand) for hand in one.action.hands)}; then the points '
              f'are {distance(plan, one.predicted)} from the goal on average.'
              for k, one in enumerate(plan.actions, start=1)]
