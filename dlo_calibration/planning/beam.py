@@ -169,7 +169,7 @@ class BeamSearch:
         if self.reached:
             self.stop_reason = 'the start is within the tolerance of the goal'
             return
-        beam, reason, stalled = [self._root], f'the largest number of actions, {self._options.actions}', 0
+        beam, reason, stalled = [self._root], '', 0
         for count in range(1, self._options.actions + 1):
             self.actions, before = count, min(map(self._rank_of, [self._root, *self._pool]))
             beam = yield from self._grown(beam)
@@ -185,6 +185,13 @@ class BeamSearch:
                 reason = 'the goal is reached'
                 break
         yield from self._conclude(reason)
+
+    @property
+    def _spent(self) -> str:
+        """Why the search ended where it has tried as many actions as it may."""
+        most, used = self._options.actions, 0 if self.judged is None else len(self.judged.steps)
+        return f'{most} actions are the most that are allowed' if used == most else \
+            f'further actions, up to {most} in all, save less than {1 - PRICE:.0%} of the error each'
 
     def _rank(self, cost: float, actions: int) -> tuple[bool, float]:
         """Return what is less for a better sequence: one that reaches the goal, or is worth its actions."""
@@ -225,7 +232,7 @@ class BeamSearch:
         for first in range(0, len(pool), WIDTH):
             if not self.reached and (first == 0 or self.judged is None):
                 yield from self._judge(pool[first:first + WIDTH])
-        self.stop_reason = reason
+        self.stop_reason = reason or self._spent
 
     def _grown(self, beam: Sequence[Course]) -> Asking[list[Course]]:
         """Return the best sequences with one more move, best first."""

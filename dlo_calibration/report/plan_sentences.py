@@ -54,6 +54,9 @@ def outcome(plan: Plan) -> str:
     tolerance = f'the tolerance of {_of_length(plan, plan.tolerance)}'
     if not plan.actions and plan.reached:
         return f'The DLO is at the goal already: {_of_length(plan, plan.error_before)}, within {tolerance}.'
+    if not plan.actions:
+        return (f'The goal is not reached, and no action is planned: the DLO stays '
+                f'{_of_length(plan, plan.error_before)} away, beyond {tolerance}.')
     count = f'{len(plan.actions)} action{"" if len(plan.actions) == 1 else "s"}'
     change = (f'the mean error goes from {_of_length(plan, plan.error_before)} to '
               f'{_of_length(plan, plan.error_after)}')

@@ -18,10 +18,14 @@ from wire import wire
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main as cli
+from dlo_calibration.files.chain_file import read_chain_file
+from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.planning.checks import checked
+from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 
@@ -88,11 +92,20 @@ def test_every_file_is_used():
     known = {SAMPLES / 'README.md', *SAMPLES.glob('make_*.py'), *SAMPLES.glob('xml/*.xml')}
     known |= {SAMPLES / 'photographs' / name
               for name in ('README.md', 'truth.json', 'first.jpg', 'second.jpg', 'third.jpg')}
+    known |= {SAMPLES / 'chains' / name for name in ('start.csv', 'goal.csv')}
     assert files(SAMPLES) == known | {message_file(kind) for kind in INPUT_TYPES} | files(*SESSIONS)
     readme = (SAMPLES / 'README.md').read_text(encoding='utf-8')
     for name in ('make_yaml.py', *(f'{kind}.yaml' for kind in INPUT_TYPES), *(one.name for one in SESSIONS),
-                 'photographs'):
+                 'photographs', 'chains'):
         assert name in readme
+
+
+def test_the_chains_are_a_start_and_a_goal_for_the_dlo_of_the_description():
+    found = read_result(SAMPLES / 'xml' / 'dlo.xml')
+    start, goal = (read_chain_file(SAMPLES / 'chains' / name) for name in ('start.csv', 'goal.csv'))
+    assert checked(found, start, goal, found.file_options.options(), PlanOptions())[0] is start
+    assert start.length == pytest.approx(found.length, rel=0.01)
+    assert goal.length == pytest.approx(found.length, rel=0.01)
 
 
 @pytest.mark.parametrize('load', [loaded_by_ruamel, loaded_by_pyyaml])

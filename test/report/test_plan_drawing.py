@@ -94,7 +94,8 @@ def test_sentences_say_what_each_hand_does_and_how_near_the_dlo_gets():
 @pytest.mark.parametrize('changes, words', [
     ({'reached': True, 'error_after': 0.005, 'actions': 1}, 'The goal is reached with 1 action: '),
     ({'reached': True, 'error_before': 0.005, 'actions': 0}, 'The DLO is at the goal already: 5 mm'),
-    ({'reached': False, 'error_after': 0.106, 'actions': 0}, 'The goal is not reached: with 0 actions, '),
+    ({'reached': False, 'error_after': 0.106, 'actions': 0},
+     'The goal is not reached, and no action is planned: '),
 ])
 def test_after_the_actions_a_sentence_is_about_the_goal(changes, words):
     assert plan_sentences(made_up_plan(**changes))[changes['actions']].startswith(words)
