@@ -89,14 +89,7 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
             executor = started = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
             stack.callback(started.close)
         rehearse, last = Rehearser(simulator, executor, should_stop, own), Rehearser(simulator, executor)
-        try:
-            while jobs := search.ask():
-                search.tell(rehearse(jobs))
-                tell(rehearse.count)
-        except CancelledError:
-            search.stop()
-            while jobs := search.ask():
-                search.tell(last(jobs))
+        _finish(search, rehearse, last, tell)
         said = () if search.reached else (*remarks(last, posterior, start, goal, options),
                                           *_remarks_on_refusals(search.refusals))
     ends = [start.points] if search.judged is None else [
@@ -108,6 +101,18 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
         score_after=float(np.mean([objective.score(end) for end in ends])), reached=search.reached,
         tolerance=tolerance, rollouts=rehearse.count + last.count, seconds=clock() - begin,
         seed=options.seed, stop_reason=search.stop_reason, remarks=said)
+
+
+def _finish(search: BeamSearch, rehearse: Rehearser, last: Rehearser, tell: Callable[[int], None]) -> None:
+    """Search to the end; once `rehearse` is stopped, `last` rehearses what the best plan so far needs."""
+    try:
+        while jobs := search.ask():
+            search.tell(rehearse(jobs))
+            tell(rehearse.count)
+    except CancelledError:
+        search.stop()
+        while jobs := search.ask():
+            search.tell(last(jobs))
 
 
 def planned_actions(judged: Judged, error: float) -> tuple[PlannedAction, ...]:
