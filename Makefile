@@ -51,13 +51,13 @@ experiment: $(STAMP)
 	@$(PYTHON) -m dlo_calibration experiment
 	$(PYTHON) benchmark/worth.py
 
-# Two processes more than there are cores, as many tests wait; four are enough.  Linear algebra and image
+# One process more than there are cores, as some tests wait; four are enough.  Linear algebra and image
 # processing shall not start threads besides, which would wait for each other.
 test: export OPENBLAS_NUM_THREADS := 1
 test: export OPENCV_FOR_THREADS_NUM := 1
 test: $(STAMP)
 	@cores=$$(nproc)
-	$(PYTHON) -m pytest --numprocesses $$((cores < 2 ? cores + 2 : 4)) --dist worksteal --durations 10
+	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10
 
 lint: $(STAMP)
 	@$(PYTHON) -m pytest $(LINT)

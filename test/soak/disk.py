@@ -65,7 +65,7 @@ class Disk:
 
 def conduct(amount: int, seed: int, folder: Path) -> Tally:
     """Fill `amount` disks."""
-    tally, choose = Tally(), random.Random(seed)
+    tally, choose, before = Tally(), random.Random(seed), largest_child()
     session = write_session(folder / 'session', session_messages(bag_types(), 2), SMALL)
     real = subprocess.run(['unshare', '-rm', 'true'], capture_output=True, check=False).returncode == 0
     for turn in range(amount):
@@ -78,8 +78,14 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
         tally.died += len(died)
         for text in (*lost, *died):
             print(f'{act.__name__}, {size} kB: {text}', file=sys.stderr, flush=True)
-    tally.remember(peak=resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
+    largest = largest_child()
+    tally.remember(peak=largest if largest > before else 0)  # else it was a child of somebody else
     return tally
+
+
+def largest_child() -> int:
+    """Return the largest resident memory of any child of this process that has ended [bytes]."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
 
 
 def on_fit(disk: Disk, session: Path) -> tuple[list[str], list[str], bool]:
