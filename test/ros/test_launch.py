@@ -37,7 +37,7 @@ SHOWN = {'calibrator': ('markers', 'progress', 'status', 'result'),
 #: Modules that launch files import, with the names used here; each becomes a record of how it was called.
 LAUNCH_NAMES = {
     'launch': ['LaunchDescription'],
-    'launch.actions': ['DeclareLaunchArgument'],
+    'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
     'launch.conditions': ['IfCondition'],
     'launch.substitutions': ['LaunchConfiguration'],
     'launch_ros': [],
@@ -53,12 +53,17 @@ def node(request):
 
 @pytest.fixture
 def described(node, monkeypatch):
-    """Give what the launch file of a node describes, with launch replaced by records of its calls."""
+    """Give what the launch file of a node describes without any argument."""
+    return launched(node, monkeypatch)
+
+
+def launched(node, monkeypatch, **given):
+    """Return what the launch file of a node describes, with launch replaced by records of its calls."""
     for module, names in LAUNCH_NAMES.items():
         replacement = ModuleType(module)
         for name in names:
             setattr(replacement, name, lambda *words, _name=name, **options: SimpleNamespace(
-                kind=_name, words=words, options=options))
+                kind=_name, words=words, options=options, perform=lambda context: context[words[0]]))
         monkeypatch.setitem(sys.modules, module, replacement)
     index = ModuleType('ament_index_python.packages')
     index.get_package_share_directory = {'dlo_calibration': str(ROOT)}.__getitem__
@@ -68,7 +73,11 @@ def described(node, monkeypatch):
         f'{node}_launch', ROOT / 'launch' / f'{node}.launch.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.generate_launch_description().words[0]
+    found = module.generate_launch_description().words[0]
+    context = {**{one.words[0]: one.options['default_value'] for one in found
+                  if one.kind == 'DeclareLaunchArgument'}, **given}
+    return [entity for one in found for entity in (
+        one.options['function'](context) if one.kind == 'OpaqueFunction' else [one])]
 
 
 def test_launch_starts_the_node_with_its_parameter_file(node, described):
@@ -82,6 +91,12 @@ def test_launch_starts_the_node_with_its_parameter_file(node, described):
     assert Path(arguments[file.words[0]]['default_value']) == ROOT / 'config' / f'{node}.yaml'
 
 
+def test_launch_passes_a_description_on(monkeypatch):
+    one, = (one for one in launched('planner', monkeypatch, description='some/result.xml')
+            if one.kind == 'Node' and one.options['package'] == 'dlo_calibration')
+    assert one.options['ros_arguments'][2:] == ['-p', 'description:=some/result.xml']
+
+
 def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
     arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
     rviz, = (one for one in described if one.kind == 'Node' and one.options['package'] == 'rviz2')
@@ -91,10 +106,10 @@ def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
     assert rviz.options['arguments'][0] == '-d'
 
 
-def test_launch_arguments_are_described(described):
-    arguments = [one.options for one in described if one.kind == 'DeclareLaunchArgument']
-    assert len(arguments) == 3
-    assert all(one['description'] for one in arguments)
+def test_launch_arguments_are_described(node, described):
+    arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
+    assert set(arguments) == {'params_file', 'rviz', 'frame', *(['description'] if node == 'planner' else [])}
+    assert all(one['description'] for one in arguments.values())
 
 
 def test_ros2_launch_knows_the_launch_file(node, install):
