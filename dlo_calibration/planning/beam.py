@@ -190,7 +190,7 @@ class BeamSearch:
     def _spent(self) -> str:
         """Why the search ended where it has tried as many actions as it may."""
         most, used = self._options.actions, 0 if self.judged is None else len(self.judged.steps)
-        return f'{most} actions are the most that are allowed' if used == most else \
+        return f'the largest number of actions, {most}, is used up' if used == most else \
             f'further actions, up to {most} in all, save less than {1 - PRICE:.0%} of the error each'
 
     def _rank(self, cost: float, actions: int) -> tuple[bool, float]:

@@ -92,7 +92,7 @@ def test_two_hands_do_in_one_action_what_one_hand_cannot():
 def test_more_actions_than_permitted_are_not_planned():
     found = planned(TWO_MOVES, replace(ONE, actions=1))
     assert len(found.actions) == 1
-    assert '1' in found.stop_reason
+    assert found.stop_reason == 'the largest number of actions, 1, is used up'
     assert found.error_after < found.error_before
 
 
