@@ -40,10 +40,10 @@ from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import session_trials
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
 from dlo_calibration.planning.rehearsal import Job, rehearse
 
-GRAVITY = 9.81  # m/s^2
 SAFETY = 0.9  # share of the friction that a held letter needs
 NODES, STEPS = 41, 12  # of a held letter; of its fit
 TOLERANCE = 0.5  # % of the length
