@@ -12,42 +12,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.model.trial import Trial
 
 SIMILAR = 100.0  # cm; the paper's judges call chains with lower scores similar
 VERY_SIMILAR = 50.0  # cm, likewise
 
 
-def focal_point(trial: Trial, goal: Goal) -> int:
+def focal_points(trial: Trial) -> NDArray[np.intp]:
     """
-    Return the index of the focal point, the paper's p_ref.
+    Return the index of the focal point of each goal, (g,), the paper's p_ref.
 
     It is the point of the goal that is nearest to a hand that holds the DLO, else the first point.
     """
-    best, index = np.inf, 0
-    for hand in trial.holding(goal):
-        position = hand.positions_at(goal.time)[0]
-        distances = np.linalg.norm(goal.chain.points - position, axis=1)
-        if distances.min() < best:
-            best, index = float(distances.min()), int(distances.argmin())
+    points, times = observed(trial), np.array([goal.time for goal in trial.goals])
+    nearest, index = np.full(len(times), np.inf), np.zeros(len(times), np.intp)
+    hands = trial.hands
+    for name in dict.fromkeys(hand.name for hand in hands):
+        paths = [hand for hand in hands if hand.name == name]
+        latest = np.searchsorted([path.start for path in paths], times, side='right') - 1
+        kept = np.array([name in goal.held_by for goal in trial.goals])
+        for k, path in enumerate(paths):
+            rows = np.flatnonzero((latest == k) & (kept | (times <= path.end)))
+            away = np.linalg.norm(points[rows] - path.positions_at(times[rows])[:, None], axis=2)
+            nearer = away.min(axis=1) < nearest[rows]
+            index[rows[nearer]] = away[nearer].argmin(axis=1)
+            nearest[rows[nearer]] = away[nearer].min(axis=1)
     return index
 
 
-def feature_points(trial: Trial, goal: Goal) -> NDArray[np.intp]:
+def feature_points(trial: Trial) -> NDArray[np.bool_]:
     """
-    Return the indices of the geometric features of a goal.
+    Return which points of each goal are geometric features, (g, n).
 
     They are local maxima and minima in z, points that a hand has gripped, and
     points that an annotator marked.
     """
-    z = goal.chain.points[:, 2]
-    rise = np.sign(np.diff(z))
-    features = goal.chain.features | trial.initial.features
-    features[1:-1] |= rise[:-1] * rise[1:] < 0
+    features = np.stack([goal.chain.features for goal in trial.goals]) | trial.initial.features
+    rise = np.sign(np.diff(observed(trial)[:, :, 2], axis=1))
+    features[:, 1:-1] |= rise[:, :-1] * rise[:, 1:] < 0
+    times = np.array([goal.time for goal in trial.goals])
     for hand in trial.hands:
-        if hand.start <= goal.time:
-            features[list(hand.grips)] = True
-    return np.flatnonzero(features)
+        features[np.ix_(hand.start <= times, np.array(hand.grips))] = True
+    return features
+
+
+def observed(trial: Trial) -> Floats:
+    """Return the points of all goals of a trial, (g, n, 3) [m]."""
+    return np.stack([goal.chain.points for goal in trial.goals])
 
 
 def difference_score(goal: Floats, current: Floats, reference: int,
@@ -83,11 +94,9 @@ class TrialScore:
     """The difference score of one trial; the terms of its goals are computed once."""
 
     def __init__(self, trial: Trial) -> None:
-        self._points = np.stack([goal.chain.points for goal in trial.goals])
-        self._reference = np.array([focal_point(trial, goal) for goal in trial.goals])
-        self._features = np.zeros(self._points.shape[:2])
-        for k, goal in enumerate(trial.goals):
-            self._features[k, feature_points(trial, goal)] = 1.0
+        self._points = observed(trial)
+        self._reference = focal_points(trial)
+        self._features = feature_points(trial).astype(float)
         self._shape = self._extent(self._points)
 
     def _extent(self, chains: Floats) -> Floats:
@@ -106,8 +115,7 @@ class TrialScore:
 
 def residuals(trial: Trial, chains: Floats) -> Floats:
     """Return simulated minus observed coordinates, (g * n * 3,) [m], goal by goal."""
-    return np.concatenate([(chain - goal.chain.points).ravel()
-                           for goal, chain in zip(trial.goals, chains, strict=True)])
+    return np.asarray(chains - observed(trial)).ravel()
 
 
 def distances(residual: Floats) -> Floats:

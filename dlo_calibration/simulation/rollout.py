@@ -11,12 +11,13 @@ Time in which the DLO stays at rest is skipped.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import cycle
 import math
-from typing import Protocol, Sequence
+from typing import Iterator, Protocol, Sequence
 
 import numpy as np
 
@@ -97,7 +98,8 @@ class _Course:
         self._steps = 0
         self._rests = False  # the DLO came to rest and no hand has acted since
         self._last = stepper.points, 0.0  # points [m] and time [s] of the step before
-        self._ahead = trial.goals  # the current goal and all later ones
+        self._goal = 0  # index of the current goal
+        self._timed = [goal.time for goal in trial.goals if not goal.stable]  # [s], increasing
         self._grips: dict[str, _Grip] = {}
         self._waiting = sorted(trial.hands, key=lambda hand: hand.start)
         self._hold()
@@ -107,7 +109,7 @@ class _Course:
         chains, settled = [], []
         traced: dict[int, Floats] = {}
         for k, goal in enumerate(self._trial.goals):
-            self._ahead = self._trial.goals[k:]
+            self._goal = k
             if goal.stable:
                 self._act_until(goal.time)
                 self._open(goal)
@@ -121,6 +123,11 @@ class _Course:
                 chains.append(traced[k])
                 settled.append(True)
         return Rollout(np.array(chains), tuple(settled), self._steps * self._stepper.time_step, self._steps)
+
+    def _goals(self, first: int) -> Iterator[Goal]:
+        """Yield the goals from an index on, without a copy: a stream has thousands."""
+        for k in range(first, len(self._trial.goals)):
+            yield self._trial.goals[k]
 
     def _observed(self, points: Floats) -> Floats:
         observed: Floats = self._layout.observe @ points
@@ -152,7 +159,7 @@ class _Course:
         end = min(events, default=math.inf) - 2 * step
         arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
         count, last = 0, first
-        for goal in self._trial.goals[first:]:
+        for goal in self._goals(first):
             too_long = goal.time - self._time > 5000 * step  # a longer path would take much memory
             if goal.stable or goal.time > end or too_long or not all(
                     self._trial.holds(hand, goal) for hand in arrived):
@@ -189,8 +196,8 @@ class _Course:
 
     def _nothing_timed_before(self, instant: float) -> bool:
         """Tell whether time until an instant may be skipped: no timed goal lies in it."""
-        return not any(not goal.stable and self._time < goal.time <= instant + self._stepper.time_step
-                       for goal in self._trial.goals)
+        return bisect_right(self._timed, self._time) >= bisect_right(
+            self._timed, instant + self._stepper.time_step)
 
     def _close(self) -> None:
         closing = [hand for hand in self._waiting if hand.start <= self._time + ROUNDING]
@@ -216,8 +223,9 @@ class _Course:
         """Open the hands that have arrived, unless the next goal shows them closed."""
         for grip in list(self._grips.values()):
             if grip.hand.end <= self._time + ROUNDING:
-                following = [goal for goal in self._ahead if goal.time > grip.hand.end]
-                if following and not self._trial.holds(grip.hand, following[0]):
+                end = grip.hand.end
+                following = next((goal for goal in self._goals(self._goal) if goal.time > end), None)
+                if following is not None and not self._trial.holds(grip.hand, following):
                     self._release(grip)
 
     def _open(self, goal: Goal) -> None:

@@ -10,7 +10,7 @@ from dlo_calibration import Action, Chain, Goal, Hand, Trial
 from dlo_calibration.model.score import (
     difference_score,
     feature_points,
-    focal_point,
+    focal_points,
     PointErrors,
     residuals,
     TrialScore,
@@ -76,17 +76,27 @@ LINE = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
 def test_the_focal_point_is_the_goals_point_nearest_to_a_hand_that_holds_it():
     hands = (hand('left', 0, 1, (2,), (0.52, 0, 0)), hand('right', 0, 1, (8,), (0.71, 0, 0)))
     held = trial(LINE, Goal(Chain(LINE), 2.0, held_by=('left', 'right')), hands=hands)
-    assert focal_point(held, held.goals[0]) == 7  # 1 cm away, the other's is 2 cm away
+    assert focal_points(held).tolist() == [7]  # 1 cm away, the other's is 2 cm away
     left = trial(LINE, Goal(Chain(LINE), 2.0, held_by=('left',)), hands=hands)
-    assert focal_point(left, left.goals[0]) == 5
+    assert focal_points(left).tolist() == [5]
     free = trial(LINE, Goal(Chain(LINE), 2.0), hands=hands)
-    assert focal_point(free, free.goals[0]) == 0
+    assert focal_points(free).tolist() == [0]
 
 
 def test_the_focal_point_of_a_timed_goal_is_where_the_hand_is_then():
     moving = Hand('left', (2,), [0.0, 1.0], [[0.2, 0, 0], [1.0, 0, 0]])
     timed = trial(LINE, Goal(Chain(LINE), 0.5, stable=False), hands=(moving,))
-    assert focal_point(timed, timed.goals[0]) == 6
+    assert focal_points(timed).tolist() == [6]
+
+
+def test_each_goal_of_a_stream_has_a_focal_point_of_its_own():
+    first = Action((Hand('left', (0,), [0.0, 1.0], [[0, 0, 0], [0.4, 0, 0]]),
+                    Hand('right', (10,), [0.5, 1.0], [[0.9, 0, 0.2], [0.9, 0, 0.0]])))
+    again = Action((Hand('left', (0,), [2.0, 3.0], [[0.4, 0, 0], [0.8, 0, 0]]),))
+    goals = [Goal(Chain(LINE), time, stable=False, held_by=('right',))
+             for time in (0.25, 0.75, 1.5, 2.5, 4.0)]
+    # The left hand alone; it is the nearer one; it has opened; it has closed again; it has opened again.
+    assert focal_points(Trial('t', Chain(LINE), (first, again), goals)).tolist() == [1, 3, 9, 6, 9]
 
 
 def bumps():
@@ -95,21 +105,25 @@ def bumps():
     return points * 0.1
 
 
+def features_of(one):
+    return [np.flatnonzero(goal).tolist() for goal in feature_points(one)]
+
+
 def test_features_are_strict_extrema_of_the_goal_grips_and_annotations():
     goal = Chain(bumps(), features=np.arange(11) == 4)
     initial = Chain(LINE, features=np.arange(11) == 6)
     hands = (hand('left', 0, 1, (0, 1), (0, 0, 0)),)
     marked = Trial('t', initial, (Action(hands),), (Goal(goal, 2.0),))
     # Extrema in z of the goal: 2 (maximum), 8 (maximum), 9 (minimum); no plateau, no end.
-    assert feature_points(marked, marked.goals[0]).tolist() == [0, 1, 2, 4, 6, 8, 9]
-    assert feature_points(trial(bumps(), Goal(Chain(LINE), 2.0)), Goal(Chain(LINE), 2.0)).tolist() == [0]
+    assert features_of(marked) == [[0, 1, 2, 4, 6, 8, 9]]
+    assert features_of(trial(bumps(), Goal(Chain(LINE), 2.0))) == [[0]]
 
 
 def test_a_grip_that_is_still_to_come_is_no_feature():
     hands = (hand('left', 0, 1, (3,), (0, 0, 0)), hand('right', 5, 6, (7,), (0, 0, 0)))
     goals = (Goal(Chain(LINE), 2.0), Goal(Chain(LINE), 8.0))
     two = trial(LINE, *goals, hands=hands)
-    assert [feature_points(two, goal).tolist() for goal in goals] == [[3], [3, 7]]
+    assert features_of(two) == [[3], [3, 7]]
 
 
 def test_the_score_of_a_trial_is_the_average_over_its_goals():
