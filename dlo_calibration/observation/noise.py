@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise: the noise level of observed points, from the roughness of the chains, and its removal."""
+"""Noise: the noise level of observed points, from roughness along chains and over time, and its removal."""
 
 from __future__ import annotations
 
@@ -16,21 +16,80 @@ ORDERS = range(2, 9)  # of the differences; higher orders do not separate curve 
 SMOOTHING = np.logspace(-8, 8, 161)  # candidate weights of the roughness
 NO_NOISE = 1e-6  # m; removing a smaller noise moves no point visibly
 KINK = 8.0  # times the median square; 99.9 % of the squares of white noise in space are below
+STREAM = 12  # views of the DLO from which on a trial shows its noise over time, too
+SLOW, SLOW_SIGMAS = 0.25, -0.6745  # share of the instants that count as slow; the normal quantile of it
 
 
 def noise(trials: Sequence[Trial]) -> float:
     """
     Return the standard deviation of one coordinate of the observed points [m].
 
-    nan where no chain has five points.  Noise that is correlated between neighbouring
-    points, as of a tracker that fits a smooth curve, is not seen.
+    It comes from the roughness of the chains along the DLO, and for trials with a stream of goals also from
+    the roughness of each point's path over time. The smaller one counts: bends make the first too large, fast
+    motion the second. nan where no chain has five points and no trial has a stream. Noise that is correlated
+    between neighbouring points, or from one instant to the next, as of a tracker that fits a smooth curve or
+    filters, is not seen.
     """
-    return noise_of([np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
-                     for trial in trials])
+    levels = []
+    for streamed in (False, True):
+        some = [trial for trial in trials if _is_stream(trial) == streamed]
+        if some:
+            along = noise_of([np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
+                              for trial in some])
+            level = np.fmin(along, _noise_over_time(some)) if streamed else along
+            levels += [float(level)] * len(some)
+    known = np.array(levels)[np.isfinite(levels)]
+    if not len(known) or (known == known[0]).all():
+        return float(known[0]) if len(known) else float('nan')
+    return float(np.sqrt(np.mean(known**2)))
+
+
+def _views(trial: Trial) -> tuple[Floats, Floats]:
+    """
+    Return when the goals of a trial were seen, (g,) [s] increasing, and their points, (g, n, 3) [m].
+
+    A chain that repeats the one before bit for bit is not a new view: trackers send the last one again.
+    """
+    times = np.array([goal.time for goal in trial.goals])
+    points = np.stack([goal.chain.points for goal in trial.goals])
+    new = np.append(True, (np.diff(times) > 0) & (points[1:] != points[:-1]).any(axis=(1, 2)))
+    return times[new], points[new]
+
+
+def _is_stream(trial: Trial) -> bool:
+    """Tell whether a trial shows the DLO often enough for differences over time."""
+    return len(trial.goals) >= STREAM and len(_views(trial)[0]) >= STREAM
+
+
+def _noise_over_time(trials: Sequence[Trial]) -> float:
+    """
+    Return the noise level [m] of trials with streams, from divided differences of each point's path.
+
+    Of each order, the lower quartile over the instants counts, when the DLO moves slowly, divided by that of
+    white noise: the squares of one instant, over their mean, are chi-square over its degrees of freedom
+    (quartile: Wilson and Hilferty, The Distribution of Chi-square, 1931). The smallest order counts.
+    """
+    rows: dict[int, list[Floats]] = {}
+    for trial in trials:
+        times, points = _views(trial)
+        for order in ORDERS:
+            windows = len(times) - order
+            if windows < 1:
+                break
+            at = np.stack([times[k:k + windows] for k in range(order + 1)], axis=1)
+            gaps = (at[:, :, None] - at[:, None, :]) / np.ptp(at, axis=1)[:, None, None]
+            weights = 1 / np.prod(gaps + np.eye(order + 1), axis=2)
+            weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+            differences = sum(weights[:, k, None, None] * points[k:k + windows] for k in range(order + 1))
+            rows.setdefault(order, []).append(np.mean(differences**2, axis=(1, 2)))
+    spread = 2 / (9 * 3 * np.mean([len(trial.initial) for trial in trials]))
+    lower = (1 - spread + SLOW_SIGMAS * np.sqrt(spread))**3
+    slow = [np.quantile(np.concatenate(squares), SLOW) for squares in rows.values()]
+    return float(np.sqrt(min(slow) / lower))
 
 
 def noise_of(observed: Sequence[Floats]) -> float:
-    """Return what `noise` does, from the chains of each trial: (g, n, 3) [m], same material points."""
+    """Return the noise level along the DLO, from the chains of each trial: (g, n, 3) [m], same points."""
     rows: dict[int, list[Floats]] = {}
     for chains in observed:
         steps = np.linalg.norm(np.diff(chains, axis=1), axis=2).mean(axis=0)

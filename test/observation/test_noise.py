@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from resting import trial_of
 
+from dlo_calibration import Action, Goal, Hand, Trial
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.observation.noise import noise, places_along, smooth
 
@@ -73,6 +74,56 @@ def test_few_points_give_the_size_at_least(count):
 def test_fewer_points_cannot_tell(count):
     chain = np.eye(4, 3)[:count]
     assert np.isnan(noise([trial_of(chain, [(0,)], chain)]))
+
+
+def swinging(rate, sigma, *, frequency=0.5, seconds=4.0, rest=0.0, stable=False, seed=3):
+    """Return a trial with a stream of a few markers [1/s, m]: rest [s], then a swing of 0.1 m."""
+    random = np.random.default_rng(seed)
+    times = np.arange(round(rate * seconds)) / rate
+    along = np.linspace(0, 1, 12)
+    turn = 2 * np.pi * frequency * np.maximum(times - rest, 0)[:, None]
+    points = np.stack([along + 0 * turn, 0.1 * np.sin(9 * along) * np.cos(turn),
+                       0.3 * along**2 + 0.1 * along * np.sin(1.7 * turn)], axis=2)
+    points += random.normal(0, sigma, points.shape)
+    hand = Hand('hand', (0,), [0.0, 1e-3 if stable else seconds], np.zeros((2, 3)))
+    goals = [Goal(Chain(one), time, stable) for one, time in zip(points[1:], times[1:], strict=True)]
+    return Trial('stream', Chain(points[0]), (Action((hand,)),), goals)
+
+
+@pytest.mark.parametrize(('rate', 'frequency'), [(100, 0.3), (100, 3), (30, 0.3), (30, 1)])
+@pytest.mark.parametrize('size', [0.05, 1.0])
+def test_a_stream_shows_the_noise_of_points_with_bends_between_them(rate, frequency, size):
+    found = noise([swinging(rate, size * MILLIMETRE, frequency=frequency)])
+    assert found == pytest.approx(size * MILLIMETRE, rel=0.1)
+
+
+def test_a_stream_of_a_dlo_at_rest_shows_the_noise_too():
+    assert noise([swinging(30, 0.1 * MILLIMETRE, rest=9.0, stable=True)]) == pytest.approx(
+        0.1 * MILLIMETRE, rel=0.1)
+
+
+def test_motion_that_is_too_fast_for_the_stream_is_no_noise():
+    slow_at_first = swinging(20, 0.1 * MILLIMETRE, frequency=4, rest=2.0)
+    assert noise([slow_at_first]) == pytest.approx(0.1 * MILLIMETRE, rel=0.15)
+    fast = swinging(10, MILLIMETRE, frequency=3)
+    few = Trial('few', fast.initial, fast.actions, fast.goals[::4])  # too few for differences over time
+    assert 0.9 * MILLIMETRE < noise([fast]) < 1.1 * noise([few])
+
+
+def test_a_tracker_that_misses_frames_sends_some_twice_or_stamps_them_unevenly_shows_the_same_noise():
+    random = np.random.default_rng(4)
+    one = swinging(60, 0.1 * MILLIMETRE)
+    missed = Trial('m', one.initial, one.actions, [goal for goal in one.goals if random.random() < 0.7])
+    twice = Trial('t', one.initial, one.actions, [Goal(one.goals[k - k % 3].chain, goal.time, False)
+                                                  for k, goal in enumerate(one.goals)])
+    for seen in (missed, twice):
+        assert noise([seen]) == pytest.approx(0.1 * MILLIMETRE, rel=0.1)
+
+
+def test_trials_with_and_without_streams_count_alike():
+    streams = [swinging(100, 0.1 * MILLIMETRE, seconds=0.4, seed=seed) for seed in range(20)]
+    assert noise([*streams, *noisy_arcs(21, True)]) == pytest.approx(
+        np.sqrt((0.01 + 1) / 2) * MILLIMETRE, rel=0.1)
 
 
 def wave(places):
