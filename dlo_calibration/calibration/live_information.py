@@ -35,6 +35,7 @@ from dlo_calibration.inference.trial_information import (
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.rest_lengths import with_shared_places
 from dlo_calibration.simulation.protocol import Simulator
 
 #: fingerprint -> (d, d) information of a trial, or why there is none, in words
@@ -128,6 +129,7 @@ class LiveInformation:
     def _appraise(self, job: _Job, trials: Sequence[Trial], options: Options,
                   result: CalibrationResult | None, informations: _Known) -> None:
         space, height = options.space, options.table_height if options.table else None
+        trials = with_shared_places(trials)
         best = None if result is None else result.best.point
         examination = None if result is None else result.examination
         done = fingerprints(result.trials) if result and examination and examination.regular else []

@@ -16,6 +16,7 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.rest_lengths import with_shared_places
 from dlo_calibration.simulation.protocol import Simulator
 
 
@@ -24,7 +25,7 @@ class Setting:
     """
     The trials, options, engine and callbacks that all stages of a calibration share.
 
-    :param trials: to calibrate on, at least one.
+    :param trials: to calibrate on, at least one; those with the same points get the same rest arc lengths.
     :param simulator: the engine, which belongs to this thread.
     :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
     :param should_stop: asked often; once True, every stage ends with what it has so far.
@@ -39,6 +40,9 @@ class Setting:
     should_stop: Callable[[], bool] = lambda: False
     on_evaluation: Callable[[Evaluation], None] = lambda _: None
     memory: Memory = field(default_factory=Memory)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'trials', with_shared_places(self.trials))
 
     @property
     def chooses_parts(self) -> bool:

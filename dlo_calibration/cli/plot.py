@@ -46,7 +46,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)
         with closing(make_simulator(source.options)) as simulator:
-            animations = write_animations(source.trials, simulator, physical, chosen.output, tell)
+            animations = write_animations(result.trials, simulator, physical, chosen.output, tell)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
                     'animations': [str(path) for path in animations]})

@@ -22,6 +22,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.rest_lengths import with_shared_places
 
 TEXT = 'simulate a session with the parameters of a result, without fitting'
 
@@ -50,6 +51,7 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     :returns: a result whose only evaluation has these parameters; values and intervals are those of `file`.
     :raises SimulationError: if a trial cannot be simulated.
     """
+    trials = with_shared_places(trials)
     with closing(make_simulator(options)) as simulator:
         begun = time.monotonic()
         evaluation = Evaluator(trials, file.space, simulator).evaluate(0, file.space.point(file.values))
@@ -59,7 +61,7 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
     warnings = tuple(f'never came to rest: {name}; the last state was compared'
                      for name in evaluation.unsettled)
     return CalibrationResult(
-        space=file.space, parameters=file.parameters, best=evaluation, trials=tuple(trials),
+        space=file.space, parameters=file.parameters, best=evaluation, trials=trials,
         chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
         seconds=seconds, search=file.search, engine=simulator.name,
         stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings)

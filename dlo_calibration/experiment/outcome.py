@@ -20,6 +20,7 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.experiment.study import Observed, Task
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.rest_lengths import with_shared_places
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def judged_chains(task: Task, outcome: Outcome, make_simulator: SimulatorFactory
     judges, found = task.judges, []
     space = replace(task.options.space, free=tuple(outcome.values))  # with the parts that the search found
     with closing(make_simulator(judges.options)) as simulator:
-        for trial in judges.trials:
+        for trial in with_shared_places(judges.trials):
             physical = space.physical(outcome.values, trial.initial.length)
             try:
                 found.append((trial, simulator.simulate(trial, physical).chains))
@@ -119,7 +120,7 @@ def _judgements(judges: Observed, result: CalibrationResult,
     found = []
     point = result.space.point(result.values)
     with closing(make_simulator(judges.options)) as simulator:
-        for trial in judges.trials:
+        for trial in with_shared_places(judges.trials):
             one = Evaluator([trial], result.space, simulator).evaluate(0, point)
             found.append(Judgement(trial.name, None, None, None) if one.errors is None else
                          Judgement(trial.name, one.score, one.errors.mean,

@@ -42,11 +42,11 @@ class Trial:
     """
     One observed manipulation: the DLO before it, the actions of the hands, and the observed goals.
 
-    :param initial: the DLO before the action; the arc lengths of its points are
-        the material coordinates of all chains of the trial.
+    :param initial: the DLO before the action; point i is the same material point in all chains.
     :param actions: one or more, in the order of their start.
     :param goals: one or more, in the order of their time.
     :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
+    :param places: (n,) [m] arc lengths of the points at rest, from 0; None: those of the initial chain.
     """
 
     name: str
@@ -54,6 +54,7 @@ class Trial:
     actions: tuple[Action, ...]
     goals: tuple[Goal, ...]
     velocity: Floats | None = None
+    places: Floats | None = None
 
     def __post_init__(self) -> None:
         thing = f'trial {self.name!r}'
@@ -87,12 +88,26 @@ class Trial:
                 raise InputError(thing, f'a velocity of shape {velocity.shape}',
                                  f'({n}, 3) finite numbers in m/s', 'give one vector per point')
             object.__setattr__(self, 'velocity', velocity)
+        if self.places is not None:
+            places = frozen_array(self.places)
+            if places.shape != (n,) or not np.isfinite(places).all() or places[0] != 0 \
+                    or not (np.diff(places) > 0).all():
+                raise InputError(thing, f'arc lengths {places}', f'{n} increasing numbers from 0, in m',
+                                 'give one for each point')
+            object.__setattr__(self, 'places', places)
 
     @property
     def hands(self) -> tuple[Hand, ...]:
         """All hands of all actions, in the order of their start."""
         return tuple(sorted((hand for action in self.actions for hand in action.hands),
                             key=lambda hand: hand.start))
+
+    @property
+    def clamped(self) -> tuple[int, ...]:
+        """The segments inside clamps that hold from the start, each by the index of its first point."""
+        grips = [sorted(hand.grips) for hand in self.hands if hand.times[0] <= 0]
+        return tuple(sorted({a for each in grips for a, b in zip(each[:-1], each[1:], strict=True)
+                             if b == a + 1}))
 
     def holding(self, goal: Goal) -> tuple[Hand, ...]:
         """Return the hands that hold the DLO when `goal` is observed, the last of each name."""

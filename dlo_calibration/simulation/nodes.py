@@ -49,28 +49,28 @@ class NodeLayout:
 
         No node lies inside a clamp that holds from the start, because that piece does not bend.
         The initial chain is smoothed according to the noise level of the trial's chains: noise
-        makes a chain longer, and bends a stiff DLO more than is possible.
+        makes a chain longer, and bends a stiff DLO more than is possible. Where the trial has the arc
+        lengths at rest, each node begins at the same share of the way between two points as at rest.
 
         :raises InputError: if more points are gripped than there are nodes.
         """
         initial = _without_noise(trial)
-        point_places = initial.arc_lengths()
+        along = initial.arc_lengths()
+        point_places = along if trial.places is None else trial.places
         grips = sorted({grip for hand in trial.hands for grip in hand.grips})
         fixed = np.unique(np.concatenate([[0.0], point_places[grips], point_places[-1:]]))
         if len(fixed) > count:
             raise InputError(f'trial {trial.name!r}', f'{len(grips)} gripped points',
                              f'fewer than the {count} nodes', 'raise the number of nodes')
-        pairs = {pair for hand in trial.hands if hand.times[0] <= 0
-                 for pair in zip(sorted(hand.grips)[:-1], sorted(hand.grips)[1:], strict=True)
-                 if pair[1] == pair[0] + 1}
-        rigid = np.isin(fixed[:-1], point_places[[first for first, _ in pairs]])
+        rigid = np.isin(fixed[:-1], point_places[list(trial.clamped)])
         places = spread_places(fixed, count, rigid)
         observe = interpolation_matrix(places, point_places)
         velocities = np.zeros((count, 3)) if trial.velocity is None else \
             interpolation_matrix(point_places, places) @ trial.velocity
-        return cls(frozen_array(places), frozen_array(initial.resample(places)), frozen_array(velocities),
+        start = places if trial.places is None else np.interp(places, point_places, along)
+        return cls(frozen_array(places), frozen_array(initial.resample(start)), frozen_array(velocities),
                    frozen_array(observe), frozen_array(point_places),
-                   frozen_array(feature_shares(initial, places)))
+                   frozen_array(feature_shares(initial, start)))
 
 
 def feature_shares(chain: Chain, places: Floats) -> Floats:

@@ -111,3 +111,18 @@ def test_a_later_hand_of_the_same_name_takes_over():
                         (Goal(CHAIN, 6.0, held_by=('left',)), (5,))):
         assert [hand.grips for hand in twice.holding(goal)] == [grips]
     assert twice.holding(Goal(CHAIN, 6.0)) == ()
+
+
+@pytest.mark.parametrize('places', [
+    [0.0, 0.1, 0.2], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.0, 0.1, 0.1, 0.2, 0.3, 0.4],
+    [0.0, 0.1, 0.2, 0.3, 0.4, np.nan]], ids=['few', 'late', 'same', 'nan'])
+def test_arc_lengths_that_do_not_increase_from_0_are_refused(places):
+    with pytest.raises(InputError, match='6 increasing numbers from 0'):
+        trial(places=places)
+    assert trial(places=np.arange(6) / 10).places.tolist() == (np.arange(6) / 10).tolist()
+
+
+def test_clamps_are_neighbours_that_one_hand_holds_from_the_start():
+    assert trial([Action([hand('a', 0.0, 1.0, (1, 0)), hand('b', 0.0, 1.0, (3, 5))]),
+                  Action([hand('c', 1.5, 1.9, (2, 3))])]).clamped == (0,)
+    assert trial().clamped == ()

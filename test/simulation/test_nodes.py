@@ -3,6 +3,8 @@
 
 """Where the nodes lie, how observed points follow from them, and the height at which a DLO rests."""
 
+from dataclasses import replace
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -179,3 +181,18 @@ def test_what_is_annotated_as_feature_belongs_to_the_nodes_beside_it():
     assert shares == pytest.approx([1, 0.8, 0.2, 0, 1])
     assert shares @ np.linspace(0, 1, 5) == pytest.approx(0.3 + 1)  # the centre of mass is where it was
     assert not feature_shares(Chain(points), np.linspace(0, 1, 5)).any()
+
+
+def test_rest_lengths_of_the_trial_count_and_the_nodes_begin_on_the_observed_curve():
+    stretched = np.linspace(0, 1, 21)**1.2
+    one = replace(trial(arc(), ((0, 1),)), places=stretched)
+    layout = NodeLayout.of(one, 41)
+    assert layout.places[-1] == 1
+    assert layout.point_places == pytest.approx(stretched)
+    assert layout.places[list(layout.nodes(one.hands[0]))] == pytest.approx(stretched[:2])
+    assert layout.points[[0, 1, -1]] == pytest.approx(arc()[[0, 1, -1]], abs=1e-9)
+    radius = np.linalg.norm(layout.points - (0, 0.4, 0), axis=1)
+    assert radius == pytest.approx(np.full(41, 0.4), abs=2e-5)
+    assert layout.observe @ layout.points == pytest.approx(arc(), abs=1e-3)
+    marked = replace(one, initial=replace(one.initial, features=np.arange(21) == 20))
+    assert NodeLayout.of(marked, 41).features[-1] == 1
