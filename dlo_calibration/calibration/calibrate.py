@@ -12,6 +12,7 @@ import math
 import time
 from typing import Callable, Sequence
 
+from dlo_calibration.calibration.automatic import choose, UNIFORM_SHARE
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.fit import Fit, fit
@@ -62,7 +63,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
     if not trials:
         raise InputError('calibration', 'no trials', 'at least one complete trial',
                          'record an initial chain, an action and a goal chain first')
-    options, begun = options or Options(), clock()
+    begun, choice = clock(), choose(trials, options or Options())
+    options = choice.options
     notices: list[str] = []
 
     def notice(text: str) -> None:
@@ -83,7 +85,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         result = with_missing_parameters(setting, result)
     result = confirmed(result, options, make_simulator, should_stop, memory)
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
-    return replace(result, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
+    return replace(result, choice=choice, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
 
 
 def fitted(setting: Setting) -> CalibrationResult:
@@ -108,8 +110,8 @@ def searched(setting: Setting, known: Prior) -> Fit:
     search = SEARCHES[options.search](known.space.dimension, options.seed, known.hints)
     if not setting.chooses_parts:
         return fit(setting, known.space, search, options.evaluations)
-    # The uniform DLO gets 40 % of the budget, so that enough is left for several parts.
-    uniform = fit(setting, known.space, search, max(1, math.ceil(0.4 * options.evaluations)))
+    # The uniform DLO gets a share of the budget, so that enough is left for several parts.
+    uniform = fit(setting, known.space, search, max(1, math.ceil(UNIFORM_SHARE * options.evaluations)))
     return fit_parts(setting, uniform, options.evaluations)
 
 

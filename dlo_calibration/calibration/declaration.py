@@ -48,6 +48,8 @@ class Declaration:
             value = float(value)
         if kind is tuple and isinstance(value, (list, tuple)):
             value = tuple(value)
+        if kind is tuple and isinstance(value, str):
+            value = (value,)
         what = f'parameter {self.name}'
         if type(value) is not kind or kind is tuple and not all(isinstance(v, str) for v in value):
             names = {bool: 'true or false', int: 'an integer', float: 'a number', str: 'a text',

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Sequence
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.engines import engine_settings
 from dlo_calibration.calibration.options import names_of, Options
@@ -34,7 +35,8 @@ def calibration_digest(trials: Sequence[Trial], options: Options) -> str:
     :raises InputError: if the scene cannot be read.
     """
     without = {*names_of(MACHINE), 'scene'}  # the content of the scene counts, not its path
-    chosen = {name: value for name, value in options.flat().items() if name not in without}
+    chosen = {name: value for name, value in choose(trials, options).options.flat().items()
+              if name not in without}
     return digest(engine_digest(options), chosen, tuple(trials))
 
 

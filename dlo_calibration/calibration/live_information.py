@@ -19,6 +19,7 @@ import queue
 import threading
 from typing import Any, Iterator, Sequence, Union
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
@@ -85,10 +86,11 @@ class LiveInformation:
         """
         if self.alive:
             raise DloCalibrationError('an appraisal is under way already')
-        if result is not None and result.space != options.space:
-            result = None
         if not whole and trials and not trials[-1].goals[-1].stable:
             trials = trials[:-1]
+        options = choose(trials, options).options
+        if result is not None and result.space != options.space:
+            result = None
         text = json.dumps(options.flat(), sort_keys=True)
         if self._base is None or self._base[0] != text or self._base[1] is not result:
             self._base, self._known = (text, result), {}

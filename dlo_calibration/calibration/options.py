@@ -22,6 +22,7 @@ from dlo_calibration.calibration.declaration import (
     refuse_name,
     SEARCH,
 )
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.processes import ANSWER_LIMIT
 from dlo_calibration.model.parameters import (
     BY_NAME,
@@ -35,8 +36,8 @@ from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 
-AUTO = 'auto'  # engine: the fastest one that supports the options; the confirming one checks its result
-CONFIRMING = 'bullet'
+AUTO = 'auto'  # calibrate: see `automatic`; engine: the fastest one that supports the options, see CONFIRMING
+CONFIRMING = 'bullet'  # the engine that checks the result of `auto`
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,10 @@ class Options(DeclaredOptions):
         'relative to the working directory; a session or document can name only a file in its own folder; '
         'empty: no obstacles', of=OBSERVATION)
     calibrate: tuple[str, ...] = declared(
-        PAPER_PARAMETERS, 'names of the parameters to find; all others keep their fixed value',
-        choices=tuple(BY_NAME), of=SEARCH)
+        (AUTO,), "names of the parameters to find; all others keep their fixed value; auto: the paper's four "
+        '(flexibility, elasticity, friction, self_collision), and what the trials show besides: damping and '
+        'internal_damping if goals were seen in motion, torsion if that was between two clamps',
+        choices=(AUTO, *BY_NAME), of=SEARCH)
     parts: int = declared(
         1, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
         'cross-validation; if flexibility is calibrated, so is the stiffness of every part; a higher '
@@ -69,8 +72,8 @@ class Options(DeclaredOptions):
     search: str = declared('least_squares', 'method that chooses the parameter sets to try',
                            choices=tuple(SEARCHES), of=SEARCH)
     evaluations: int = declared(
-        150, "largest number of parameter sets to try (the paper's rounds)", minimum=1,
-        maximum=1000000, of=SEARCH)
+        0, "largest number of parameter sets to try (the paper's rounds); 0: 150, or more if there are many "
+        'parameters to find', minimum=0, maximum=1000000, of=SEARCH)
     seed: int = declared(1, 'random seed; the same seed gives the same result', minimum=0, maximum=2**31 - 1,
                          of=SEARCH)
     engine: str = declared(
@@ -118,7 +121,10 @@ class Options(DeclaredOptions):
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
-        ParameterSpace(self.calibrate)  # refuses an empty list and a name given twice
+        if AUTO in self.calibrate and self.calibrate != (AUTO,):
+            raise InputError('parameter calibrate', ', '.join(self.calibrate), 'auto alone, or only names',
+                             'leave auto out, and name every parameter to find')
+        ParameterSpace(self._names)  # refuses an empty list and a name given twice
 
     @classmethod
     def declarations(cls) -> tuple[Declaration, ...]:
@@ -143,9 +149,18 @@ class Options(DeclaredOptions):
 
     @property
     def space(self) -> ParameterSpace:
-        """The parameters to find, and the fixed values of the others."""
-        parts = max(self.parts, ParameterSpace(self.calibrate).parts)
-        return ParameterSpace(self.calibrate, self.values, self.mass).divided(parts)
+        """
+        The parameters to find, and the fixed values of the others.
+
+        Where `calibrate` is auto, these are the paper's parameters, which it always finds; `automatic.choose`
+        adds those that the trials show.
+        """
+        parts = max(self.parts, ParameterSpace(self._names).parts)
+        return ParameterSpace(self._names, self.values, self.mass).divided(parts)
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return PAPER_PARAMETERS if self.calibrate == (AUTO,) else self.calibrate
 
 
 FIXED_VALUES: Mapping[str, Declaration] = {

@@ -29,6 +29,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
         'trials': len(result.trials), 'evaluations': len(result.evaluations),
         'simulations': result.simulations, 'seconds': result.seconds, 'engine': result.engine,
         'search': result.search, 'seed': result.seed, 'stop_reason': result.stop_reason,
+        'choice': result.choice.words if result.choice else '',
         'warnings': result.warnings,
         'cross_validated_error_m': found and found.cross_validated,
         'default_error_m': found and found.default_error,

@@ -10,6 +10,7 @@ from typing import Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.automatic import Choice
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
@@ -64,6 +65,7 @@ class CalibrationResult:
     :param advice: which action to observe next; None if none would help, or it was not computed.
     :param missing_parameters: fixed parameters that would explain part of the residuals; empty if noise
         explains the residuals, or if it was not computed.
+    :param choice: the options with what was decided from the trials; None: nothing was calibrated.
     """
 
     space: ParameterSpace
@@ -82,6 +84,7 @@ class CalibrationResult:
     examination: Examination | None = None
     advice: Advice | None = None
     missing_parameters: tuple[MissingParameter, ...] = ()
+    choice: Choice | None = None
 
     @classmethod
     def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:

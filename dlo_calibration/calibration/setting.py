@@ -9,6 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Callable
 
+from dlo_calibration.calibration.automatic import choose, chooses_parts
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
@@ -26,6 +27,8 @@ class Setting:
     The trials, options, engine and callbacks that all stages of a calibration share.
 
     :param trials: to calibrate on, at least one; those with the same points get the same rest arc lengths.
+    :param trials: to calibrate on, at least one.
+    :param options: those that are open are decided from the trials.
     :param simulator: the engine, which belongs to this thread.
     :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
     :param should_stop: asked often; once True, every stage ends with what it has so far.
@@ -43,11 +46,12 @@ class Setting:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'trials', with_shared_places(self.trials))
+        object.__setattr__(self, 'options', choose(self.trials, self.options).options)
 
     @property
     def chooses_parts(self) -> bool:
         """Whether cross-validation over the trials chooses the number of parts."""
-        return self.options.parts == 0 and len(self.trials) > 1 and 'flexibility' in self.options.calibrate
+        return chooses_parts(self.trials, self.options)
 
     @property
     def own_simulator(self) -> Simulator:

@@ -12,6 +12,7 @@ from pathlib import Path
 import threading
 from typing import Any
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.plain import known, plain
 from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
@@ -86,7 +87,8 @@ class Calibrating:
         make_folder(self.folder)
         begun = self._connections.begin(self.folder, session, notices.append)
         self._begun, self._notices, self._digest = begun, notices, digest
-        self._progress = Progress(begun.options.evaluations, len(begun.trials))
+        chosen = choose(begun.trials, begun.options).options
+        self._progress = Progress(chosen.evaluations, len(begun.trials))
         self.state, self.text = CALIBRATING, ''
         self._worker.start(begun.trials, begun.options, begun.log)
 

@@ -145,7 +145,7 @@ def _recorded(chosen: argparse.Namespace) -> dict[str, Any]:
 def _sentences(result: CalibrationResult) -> list[str]:
     from dlo_calibration.report.sentences import sentences
 
-    return sentences(result)
+    return [*([result.choice.words] if result.choice and result.choice.words else []), *sentences(result)]
 
 
 def _graph() -> Graph | None:

@@ -96,7 +96,8 @@ def _plan(chosen: argparse.Namespace) -> Plan:
         judges = _observed(chosen, others[k], FileOptions(own.options.flat())) if others else None
         subjects.append(Subject(name, own, held, judges))
     options = subjects[0].observed.options
-    return Plan(tuple(subjects), searches, chosen.runs, options.seed, options.evaluations, options.workers,
+    most = max(subject.observed.options.evaluations for subject in subjects)
+    return Plan(tuple(subjects), searches, chosen.runs, options.seed, most, options.workers,
                 _command(chosen, searches), samples=not chosen.sessions)
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.plain import plain
@@ -91,7 +92,8 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
             told.append(text)
 
     with StopFlag() as stop:
-        with SearchBar(source.options.evaluations, sys.stderr, shown=not chosen.json,
+        most = choose(source.trials, source.options).options.evaluations
+        with SearchBar(most, sys.stderr, shown=not chosen.json,
                        known=log.evaluations if log else 0) as bar:
             try:
                 result = calibrate(

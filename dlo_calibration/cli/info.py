@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.cli.source import add_source, read_source, Source
@@ -32,11 +33,13 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 def _about(source: Source) -> dict[str, Any]:
     """Return what a session contains, as plain values."""
+    choice = choose(source.trials, source.options)
     return {
         'session': str(source.path), 'duration_s': source.session.duration,
         'frames': list(source.session.frames),
         'messages': dict(sorted(source.session.counts.items())),
-        'options': source.session.recorded,
+        'options': source.session.recorded, 'calibrate': list(choice.options.calibrate),
+        'choice': choice.words,
         'trials': [_about_trial(trial) for trial in source.trials],
         'refusals': list(source.refusals), 'problems': list(source.session.problems)}
 

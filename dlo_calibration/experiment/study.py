@@ -20,6 +20,7 @@ from typing import Any, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.errors import InputError
@@ -31,10 +32,17 @@ SHOWING = ('cli', 'report', 'ros')
 
 @dataclass(frozen=True)
 class Observed:
-    """The trials of a DLO, and the options to simulate them with."""
+    """
+    The trials of a DLO, and the options to simulate them with.
+
+    :param options: those that are open are decided from all trials, so that leaving one out changes none.
+    """
 
     trials: tuple[Trial, ...]
     options: Options
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'options', choose(self.trials, self.options).options)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
+from dlo_calibration.calibration.automatic import DECIDED
 from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
@@ -43,7 +44,7 @@ from dlo_calibration.model.score import PointErrors
 
 WHAT = 'result file'  # in errors
 #: Attributes of the calibration, in the order of the document.
-HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason')
+HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason', 'choice')
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Description:
     :param chain: the DLO at rest, before the first trial's action, with its annotations.
     :param correlations: of each pair of found parameters, by name, -1 to 1; None: they are unknown.
     :param options: options of the calibration, by name; empty where they were not given.
+    :param choice: which parameters `calibrate` auto has chosen, and why; empty where they were named.
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
     :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
@@ -83,6 +85,7 @@ class Description:
     stop_reason: str
     correlations: Mapping[str, Mapping[str, float]] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    choice: str = ''
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
     problems: tuple[str, ...] = ()
@@ -98,11 +101,14 @@ class Description:
         space, told = result.space, plain(result)
         fixed = {p.name: space.fixed.get(p.name, p.default) for p in space.parameters
                  if p.name not in result.parameters and (p.name != 'mass' or 'mass' in space.fixed)}
+        decided = result.choice.options.flat() if result.choice else {}
         return cls(
             parameters=result.parameters, mass=space.mass, fixed=fixed,
             length=result.length, chain=result.trials[0].initial, score=result.best.score,
             trials=tuple(trial.name for trial in result.trials), scores=result.best.scores,
-            errors=result.errors, correlations=result.correlations, options=options or {},
+            errors=result.errors, correlations=result.correlations,
+            options={name: decided.get(name, value) if name in DECIDED else value
+                     for name, value in (options or {}).items()},
             warnings=result.warnings, confirmation=result.confirmation, **{key: told[key] for key in HOW})
 
     @property
@@ -206,7 +212,7 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
             seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
             simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
             stop_reason=calibration.get('stop_reason'), correlations=_correlations(where, parameters),
-            options=given.values,
+            options=given.values, choice=calibration.get('choice', ''),
             problems=given.problems, refusal=given.refusal,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=_confirmation(where, second[0]) if second else None)

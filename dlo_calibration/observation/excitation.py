@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -12,10 +13,70 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
-from dlo_calibration.model.trial import Trial
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.noise import noise
 
 BETWEEN = 9  # interpolated chains from one observed chain to the next
+NEAR = 0.25  # s; a motion is seen from one chain to another that is no later
+STILL = 0.005  # m/s; a slower hand or DLO rests
+TURNING = 0.05  # rad/s; a hand that turns more slowly rests
+
+
+@dataclass(frozen=True)
+class Motions:
+    """
+    What the timed goals of trials show.
+
+    :param seen: whether hands or DLO move in one of them.
+    :param between_clamps: whether two hands or more clamp the DLO meanwhile.
+    """
+
+    seen: bool = False
+    between_clamps: bool = False
+
+
+def motions(trials: Sequence[Trial]) -> Motions:
+    """Return what the timed goals of trials show; a goal while hands and DLO wait shows no motion."""
+    timed = [(trial, [goal for goal in trial.goals if not goal.stable]) for trial in trials]
+    moving = [(trial, goal) for trial, goals in timed
+              for goal, moves in zip(goals, _moves(trial, goals), strict=True) if moves]
+    moving = moving or _swinging(trials)
+    return Motions(bool(moving), any(
+        sum(len(hand.grips) > 1 for hand in trial.holding(goal)) > 1 for trial, goal in moving))
+
+
+def _moves(trial: Trial, goals: Sequence[Goal]) -> NDArray[np.bool_]:
+    """
+    Tell of each timed goal whether it surely shows a motion, (g,).
+
+    It does where a hand moves, where the DLO was moving when the trial began, and where no hand is under way:
+    whoever observes the DLO in motion then makes the goal a timed one.
+    """
+    times = np.array([goal.time for goal in goals])
+    found = np.full(len(goals), trial.velocity is not None)
+    waiting = np.zeros(len(goals), np.bool_)
+    for hand in trial.hands if len(goals) else ():
+        (place, turn), (place_after, turn_after) = (hand.poses(times + k * NEAR / 2) for k in (-1, 1))
+        ways = np.linalg.norm(place_after - place, axis=1)
+        # The Frobenius distance of two rotations is 2 sqrt(2) sin(angle / 2).
+        angles = np.linalg.norm(turn_after - turn, axis=(1, 2)) / np.sqrt(2)
+        under_way = (hand.start <= times) & (times <= hand.end)
+        found |= under_way & ((ways > STILL * NEAR) | (angles > TURNING * NEAR))
+        waiting |= under_way
+    return found | ~waiting
+
+
+def _swinging(trials: Sequence[Trial]) -> list[tuple[Trial, Goal]]:
+    """Return the timed goals that differ from the next one, shortly after, by more than noise explains."""
+    pairs = [(trial, one, other) for trial in trials
+             for one, other in zip(trial.goals[:-1], trial.goals[1:], strict=True)
+             if not one.stable and 0 < other.time - one.time <= NEAR]
+    if not pairs:
+        return []
+    sigma = np.nan_to_num(noise(trials))
+    return [(trial, one) for trial, one, other in pairs
+            if np.sqrt(np.mean((other.chain.points - one.chain.points)**2))
+            > 4 * sigma + STILL * (other.time - one.time)]
 
 
 def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None

@@ -96,7 +96,7 @@ def _missing_parameters(result: CalibrationResult) -> list[str]:
     if not shares:
         return []
     names = [one.name for one in result.missing_parameters if one.name != PARTS]
-    how = [f'add {" or ".join(names)} to calibrate'] * bool(names)
+    how = [f'name {" or ".join(names)} in calibrate, beside {", ".join(result.space.free)}'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
     return [f'Parameters that were held fixed would explain these shares of the squared residuals: '
             f'{", ".join(shares)}. To calibrate them, too, {"; or ".join(how)}.']

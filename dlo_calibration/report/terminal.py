@@ -194,11 +194,13 @@ def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
 def print_result(result: CalibrationResult, stream: TextIO,
                  how: Mapping[str, Any] = MappingProxyType({})) -> None:
     """
-    Print tables of the parameters and of the fit, then the sentences of the result.
+    Print which parameters were chosen, tables of the parameters and of the fit, and the sentences.
 
     :param how: plain values that replace those of the result.
     """
     out, values = console(stream), {**plain(result), **how}
+    if values['choice']:
+        out.print(escape(values['choice']))
     out.print(parameter_table(values['parameters']))
     out.print(facts_table('fit', fit_facts(values)))
     for sentence in sentences.sentences(result):
@@ -213,6 +215,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
         ('duration', f"{number(about['duration_s'])} s"),
         ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
         *((topic, f'{count} messages') for topic, count in about['messages'].items()),
+        ('calibrate', about['choice'] or ', '.join(about['calibrate'])),
     ]))
     if about['trials']:
         head = ('name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')

@@ -104,7 +104,7 @@ class OptionsNode(Node, Generic[Chosen]):
         """
         Convert parameters to the types of their declarations.
 
-        `ros2 param set` sends an integer for 1, and for [] a list of something else than texts.
+        `ros2 param set` sends an integer for 1, a text for a list of one, and for [] a list of other things.
         """
         return [_in_type_of(self._declared[p.name], p) if p.name in self._declared else p for p in parameters]
 
@@ -122,6 +122,8 @@ def _in_type_of(declaration: Declaration, given: Parameter) -> Parameter:
         return Parameter(given.name, Parameter.Type.DOUBLE, float(given.value))
     if isinstance(declaration.default, tuple) and _plain(given.value) == []:
         return Parameter(given.name, Parameter.Type.STRING_ARRAY, NO_TEXTS)
+    if isinstance(declaration.default, tuple) and given.type_ == Parameter.Type.STRING:
+        return Parameter(given.name, Parameter.Type.STRING_ARRAY, [given.value])
     return given
 
 

@@ -14,6 +14,7 @@ from collections import Counter
 import time
 from typing import Any, Callable, Mapping
 
+from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.live_information import LiveInformation
 from dlo_calibration.calibration.options import Options
@@ -224,13 +225,15 @@ class CalibrationSession:
         self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         log = self._recorder.start(trials, options)
         situation = self._situation
-        progress = Progress(options.evaluations, len(trials), log.evaluations if log else 0)
+        choice = choose(trials, options)
+        progress = Progress(choice.options.evaluations, len(trials), log.evaluations if log else 0)
         self._calibration = Calibration(options, progress, situation)
         situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
         situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
         self._worker.start(trials, options, log)
-        return f'calibrating on {len(trials)} trial(s), {options.evaluations} evaluations'
+        return ' '.join([f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations'
+                         f'{"." * bool(choice.words)}', choice.words]).rstrip()
 
     def _start_by_itself(self) -> None:
         situation, wanted = self._situation, self._graph.options().start_after_trials

@@ -19,8 +19,8 @@ DECLARED = {declaration.name: declaration for declaration in declarations()}
 #: The defaults that are part of the message contract.
 CONTRACT = {
     'mass': 0.0, 'table': True, 'table_height': 0.0,
-    'calibrate': ['flexibility', 'elasticity', 'friction', 'self_collision'],
-    'search': 'least_squares', 'evaluations': 150, 'grip_tolerance': 0.02, 'length_tolerance': 50.0,
+    'calibrate': ['auto'], 'search': 'least_squares', 'evaluations': 0,
+    'grip_tolerance': 0.02, 'length_tolerance': 50.0,
     'start_after_trials': 0, 'output_directory': '.', 'record': True, 'release': True,
     'engine': 'auto', 'workers': 0,
 }
@@ -51,7 +51,7 @@ def test_every_option_is_declared_completely(declaration):
 
 
 WRONG = {bool: (1, 'true', None), int: (1.0, '1', True, None), float: ('1', True, None, [1.0]),
-         str: (1, None, ['a']), tuple: ('friction', 1, [1], None)}
+         str: (1, None, ['a']), tuple: (1, [1], None)}
 EXPECTED = {bool: 'true or false', int: 'an integer', float: 'a number', str: 'a text',
             tuple: 'a list of names'}
 
@@ -111,6 +111,13 @@ def test_an_integer_is_a_number_too():
     assert Options.of({'mass': 1, 'friction': 30}).flat()['mass'] == 1.0
 
 
+def test_auto_stands_alone():
+    with pytest.raises(InputError, match='calibrate: got friction, auto, expected auto alone, or only names; '
+                                         'leave auto out'):
+        Options.of({'calibrate': ['friction', 'auto']})
+    assert Options(calibrate='auto') == Options.of({'calibrate': 'auto'}) == Options()
+
+
 @pytest.mark.parametrize('names', [[], ['friction', 'friction']])
 def test_a_calibration_of_nothing_or_of_something_twice_is_refused(names):
     with pytest.raises(InputError, match='calibrate: got .* expected one or more different names'):
@@ -127,7 +134,9 @@ def values(declaration):
     if kind is float:
         return st.floats(declaration.minimum, declaration.maximum)
     if kind is tuple:
-        return st.lists(st.sampled_from(declaration.choices), min_size=1, unique=True)
+        names = st.lists(st.sampled_from([one for one in declaration.choices if one != 'auto']), min_size=1,
+                         unique=True)
+        return names | st.just(['auto'])
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
 
 

@@ -33,14 +33,15 @@ from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.inference.slices import simulate_slices
 from dlo_calibration.messages.codec import bag_types, INITIAL
+from dlo_calibration.model.parameters import PAPER_PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 FIT_KEYS = {
     'parameters', 'score', 'scores', 'mean_error_m', 'rms_error_m', 'max_error_m', 'mean_abs_error_m',
     'error_percent_of_length', 'trials', 'evaluations', 'simulations', 'seconds', 'engine', 'search', 'seed',
-    'stop_reason', 'warnings', 'confirmation', 'cross_validated_error_m', 'default_error_m', 'noise_m',
-    'residual_std_m', 'correlations', 'undetermined', 'advice'}
+    'stop_reason', 'choice', 'warnings', 'confirmation', 'cross_validated_error_m', 'default_error_m',
+    'noise_m', 'residual_std_m', 'correlations', 'undetermined', 'advice'}
 PARAMETER_KEYS = {'value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper',
                   'physical_unit', 'identifiable', 'verdict', 'note'}
 PATIENCE = 60.0
@@ -80,7 +81,7 @@ def test_fit_prints_one_document_with_every_key(run, session):
     found = only_json(output)
     assert code == 0
     assert set(found) >= FIT_KEYS
-    assert list(found['parameters']) == list(Options().calibrate)
+    assert list(found['parameters']) == list(PAPER_PARAMETERS)
     assert all(set(one) == PARAMETER_KEYS for one in found['parameters'].values())
     assert (found['trials'], found['evaluations']) == (2, 20)
     assert found['simulations'] > 40  # what was examined around the result counts
@@ -106,7 +107,7 @@ def test_flags_come_before_recorded_options_and_say_so(run, session):
 
 def test_correlations_are_between_the_parameters_by_name(run, session):
     found = only_json(run('fit', session, '--json', '--evaluations', 150)[1])
-    names = list(Options().calibrate)
+    names = list(PAPER_PARAMETERS)
     assert list(found['correlations']) == names
     for one in names:
         assert list(found['correlations'][one]) == names
@@ -228,7 +229,10 @@ def test_info_tells_what_is_in_a_session(run, session):
     assert [hand['name'] for hand in trial['hands']] == ['left_hand']
     assert found['frames'] == ['world']
     assert found['refusals'] == found['problems'] == []
-    assert 'left_hand' in run('info', session)[1]
+    assert found['calibrate'] == list(PAPER_PARAMETERS)
+    for_people = run('info', session)[1]
+    assert 'left_hand' in for_people
+    assert 'Calibrated: flexibility' in for_people
 
 
 def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
@@ -255,7 +259,7 @@ def test_session_without_complete_trial_is_refused_by_fit_and_described_by_info(
     [], ['paint'], ['fit'], ['fit', 'SESSION', '--masss', '1'], ['fit', 'SESSION', '--mass', 'heavy'],
     ['fit', 'SESSION', '--mass', '-1'], ['fit', 'SESSION', '--search', 'magic'],
     ['fit', 'SESSION', '--calibrate', 'colour'], ['fit', 'SESSION', '--calibrate', 'friction,friction'],
-    ['fit', 'SESSION', '--evaluations', '0'], ['fit', 'nowhere'], ['info', 'nowhere'], ['info', 'TEXT'],
+    ['fit', 'SESSION', '--evaluations', '-1'], ['fit', 'nowhere'], ['info', 'nowhere'], ['info', 'TEXT'],
     ['validate', 'nowhere', 'SESSION'], ['validate', 'TEXT', 'SESSION'],
     ['fit', 'SESSION', '--output', 'TEXT'], ['fit', 'SESSION', '--eval', '3'],
 ], ids=' '.join)

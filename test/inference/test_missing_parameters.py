@@ -31,7 +31,8 @@ def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
     assert result.missing_parameters[0].name == name
     assert result.missing_parameters[0].share > 0.15
-    assert f'add {name}' in sentences(result)[-1]
+    assert f'name {name}' in sentences(result)[-1]
+    assert f'in calibrate, beside {", ".join(EVEN.free)}' in sentences(result)[-1]
     assert plain(result)['explanations'][name] == result.missing_parameters[0].share
 
 

@@ -69,7 +69,7 @@ def test_result_tells_the_whole(types):
         assert float(values.pop(f'{key}_error_mm')) == pytest.approx(millimetres)
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
-        'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent',
+        'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent', 'choice': '',
         'warnings': 'one; two', 'undetermined': '', 'cross_validated_error_mm': '', 'default_error_mm': '',
         'noise_mm': '', 'residual_std_mm': ''}
     assert one.level == types.level(1)

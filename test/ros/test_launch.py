@@ -16,10 +16,10 @@ from made_up_plan import made_up_plan
 import pytest
 from ruamel.yaml import YAML
 
-from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
+from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.planning import PlanProgress
 from dlo_calibration.ros import diagnostics, planner_diagnostics, planner_session
 
@@ -167,13 +167,13 @@ def test_foxglove_shows_every_panel_that_is_set_up_and_no_other(node):
 
 
 def test_foxglove_plots_values_that_the_node_sends():
-    best = Evaluation(0, None, dict.fromkeys(Options().calibrate, 50.0), (1.0,))
+    best = Evaluation(0, None, dict.fromkeys(PAPER_PARAMETERS, 50.0), (1.0,))
     message = diagnostics.progress(bag_types(), stamp=1, evaluation=best, best=best, evaluations=2,
                                    simulations_per_second=1.0, seconds_left=1.0,
-                                   spread=dict.fromkeys(Options().calibrate, 1.0))
+                                   spread=dict.fromkeys(PAPER_PARAMETERS, 1.0))
     plotted = foxglove_plots('calibrator')
     assert plotted <= sent('progress', message)
-    assert {('progress', 'progress', f'{what}_{name}') for name in Options().calibrate
+    assert {('progress', 'progress', f'{what}_{name}') for name in PAPER_PARAMETERS
             for what in ('best', 'spread')} <= plotted
     assert {('progress', 'progress', 'score'), ('progress', 'progress', 'best_score')} <= plotted
 

@@ -26,12 +26,13 @@ from toy_messages import session_messages
 from toy_simulator import Deadly, ToySimulator
 
 from dlo_calibration import InputError
-from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.options import declarations
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.ros.calibrator_node import CalibratorNode, spin
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
@@ -71,7 +72,7 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     robot.until_status(state='collecting', trials='3')
     assert robot.call('start').success
     live = robot.until_result()
-    assert [one.name for one in live.status] == [*Options().calibrate, 'calibration']
+    assert [one.name for one in live.status] == [*PAPER_PARAMETERS, 'calibration']
     assert whole(live)['trials'] == '3'
     assert whole(live)['seed'] == '7'
     robot.until(lambda: robot.heard['progress'])
@@ -230,7 +231,8 @@ def test_bad_value_is_refused_with_the_reason_and_changes_nothing(start_node):
     for name, value, reason in (
             ('search', 'magic', 'random'), ('calibrate', ['flexibility', 'colour'], 'colour'),
             ('calibrate', ['friction', 'friction'], 'different'), ('mass', -1.0, 'mass'),
-            ('evaluations', 0, 'evaluations'), ('table', 3, 'BOOL')):
+            ('evaluations', -1, 'evaluations'), ('calibrate', ['auto', 'damping'], 'alone'),
+            ('table', 3, 'BOOL')):
         answer, = node.set_parameters([Parameter(name, value=value)])
         assert not answer.successful
         assert reason in answer.reason

@@ -70,7 +70,7 @@ def test_node_starts_with_the_file_and_takes_what_was_changed_in_it(ros_environm
 
     text = FILE.read_text(encoding='utf-8').replace('output_directory: "."',
                                                     f'output_directory: "{tmp_path}"')
-    changed = text.replace('evaluations: 150', 'evaluations: 7').replace(
+    changed = text.replace('evaluations: 0', 'evaluations: 7').replace(
         '    mass: 0.0', '    mass: 0.25')
     for name, content, expected in (
             ('same.yaml', text, {}), ('changed.yaml', changed, {'evaluations': 7, 'mass': 0.25})):
