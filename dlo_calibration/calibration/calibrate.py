@@ -97,6 +97,7 @@ def fitted(setting: Setting) -> CalibrationResult:
     known = prior(setting.trials, setting.options)
     found = searched(setting, known)
     found = examined(setting, found)
+    found = replace(found, best=setting.judged(found.space, found.best))
     return CalibrationResult.of(setting, known, found)
 
 

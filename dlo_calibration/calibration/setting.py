@@ -11,10 +11,12 @@ from typing import Callable
 
 from dlo_calibration.calibration.automatic import choose, chooses_parts
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.rest_lengths import with_shared_places
@@ -60,7 +62,29 @@ class Setting:
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
                  finer: Simulator | None = None) -> BatchEvaluator:
-        """Return an evaluator of points of a space, by default with the setting's trials and engine."""
-        evaluator = Evaluator(trials or self.trials, space, finer or self.simulator)
+        """
+        Return an evaluator of points of a space, by default with the setting's trials and engine.
+
+        Its residuals are those of the compared goals.
+        """
+        evaluator = Evaluator(trials or self.trials, space, finer or self.simulator, every_goal=False)
         return BatchEvaluator(evaluator, self.should_stop, self.executor,
                               self.memory.of(evaluator, finer is not None))
+
+    def judged(self, space: ParameterSpace, one: Evaluation) -> Evaluation:
+        """
+        Return an evaluation with its residuals at every goal: it is simulated again if they were not kept.
+
+        :raises SimulationError: if it cannot be simulated again.
+        """
+        if compared_rows(self.trials) is None:
+            return one
+        evaluator = Evaluator(self.trials, space, self.simulator)
+        memory = self.memory.of(evaluator)
+        found = memory.find(one.index, one.point)
+        if found is None:
+            found = evaluator.evaluate(one.index, one.point)
+            memory.add(found)
+        if found.residuals is None:
+            raise SimulationError(found.failure)
+        return found

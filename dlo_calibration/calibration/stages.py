@@ -21,6 +21,7 @@ from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.missing_parameters import missing_parameters
@@ -48,10 +49,12 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
     found, best = result.examination, result.best
     if found is None or not found.regular or best.residuals is None or found.noise_alone:
         return result
+    rows = compared_rows(result.trials)
     try:
         return replace(result, missing_parameters=missing_parameters(
-            Evaluator(result.trials, result.space, setting.own_simulator),
-            Linearisation(best.point, best.residuals, found.jacobian), setting.should_stop))
+            Evaluator(result.trials, result.space, setting.own_simulator, every_goal=False),
+            Linearisation(best.point, best.residuals if rows is None else best.residuals[rows],
+                          found.jacobian), setting.should_stop))
     except CancelledError:
         return result
 

@@ -16,10 +16,10 @@ from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
@@ -40,7 +40,8 @@ def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
     except CancelledError:
         return replace(fit, examination=None, stopped=True)
     count = examination.evaluations + fit.examined
-    return replace(fit, best=best, examination=replace(examination, evaluations=count))
+    band = frozen_array(at_every_goal(examination.band, setting.trials))
+    return replace(fit, best=best, examination=replace(examination, evaluations=count, band=band))
 
 
 def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, Evaluation]:
@@ -57,7 +58,7 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
     evaluate = setting.evaluate(space)
     try:
         examination = examine(
-            best.point, best.residuals, ResidualLayout.of(trials), evaluate.residuals,
+            best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
             default=default, noise=sigma,
             finer=None if finer is None else setting.evaluate(space, finer=finer).residuals,
             starts=[setting.evaluate(space, others).residuals

@@ -24,7 +24,7 @@ class Evaluation:
     :param values: free parameters on the 0..100 scale.
     :param scores: difference score of each trial [cm]; empty if the evaluation failed.
     :param errors: over all points of all goals; None if the evaluation failed.
-    :param residuals: (m,) [m]; kept for the best evaluation only.
+    :param residuals: (m,) [m] at the goals that the evaluator compares; kept for the best evaluation only.
     :param unsettled: names of the trials in which the DLO never came to rest.
     :param failure: why the evaluation failed; empty if it did not.
     :param skipped: number of trials that were not simulated because an earlier one failed.

@@ -14,6 +14,7 @@ import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
@@ -31,18 +32,37 @@ class Evaluator:
     Tries parameter sets on trials.
 
     Worker processes get a pickled one and worker threads a copy; see `Simulator`.
+
+    :param every_goal: whether its residuals are those of every goal; if not, they are those of the
+        `compared_goals`. Scores and errors are always those of every goal.
     """
 
-    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator) -> None:
+    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
+                 every_goal: bool = True) -> None:
         self.trials = tuple(trials)
         self.space = space
         self.simulator = simulator
+        self._rows = None if every_goal else compared_rows(trials)
         self._length = mean_length(trials)
         self._scores = tuple(TrialScore(trial) for trial in trials)
 
     def __copy__(self) -> Evaluator:
         """Return an evaluator with a simulator of its own."""
-        return Evaluator(self.trials, self.space, copy.copy(self.simulator))
+        return self._with(simulator=copy.copy(self.simulator))
+
+    def of(self, space: ParameterSpace) -> Evaluator:
+        """Return an evaluator with other parameters."""
+        return self._with(space=space)
+
+    def _with(self, **changes: object) -> Evaluator:
+        other = Evaluator.__new__(Evaluator)
+        vars(other).update({**vars(self), **changes})  # what belongs to the trials never changes
+        return other
+
+    @property
+    def layout(self) -> ResidualLayout:
+        """The order of its residuals."""
+        return ResidualLayout.of(self.trials) if self._rows is None else ResidualLayout.compared(self.trials)
 
     def simulate(self, values: Mapping[str, float]) -> list[Rollout]:
         """Simulate every trial with free parameters on the 0..100 scale."""
@@ -75,4 +95,5 @@ class Evaluator:
                             if not all(rollout.settled)))
         residual = np.concatenate([residuals(trial, rollout.chains)
                                    for trial, rollout in zip(self.trials, rollouts, strict=True)])
-        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(residual))
+        kept = residual if self._rows is None else residual[self._rows]
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(kept))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import astuple, fields
 from typing import Callable, Mapping, Sequence
 
 import numpy as np
@@ -14,11 +15,12 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.log import digest, Entry, EVALUATION, EvaluationLog, ROLLOUT
-from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Rollout, Simulator
+
+ERRORS = len(fields(PointErrors))
 
 
 class Memory:
@@ -44,7 +46,7 @@ class Memory:
         """
         base = '' if self._log is None else digest(
             self._engine, evaluator.simulator.name, finer, [self.digest(trial) for trial in evaluator.trials],
-            evaluator.space)
+            evaluator.space, evaluator.layout)
         return EvaluatorMemory(self, base, evaluator)
 
     def simulator(self, simulator: Simulator) -> Simulator:
@@ -86,7 +88,7 @@ class EvaluatorMemory:
     def __init__(self, memory: Memory, base: str, evaluator: Evaluator) -> None:
         self._memory, self._base = memory, base
         self._trials, self._space = evaluator.trials, evaluator.space
-        self._size = sum(rows.stop - rows.start for rows in ResidualLayout.of(evaluator.trials).rows)
+        self._size = evaluator.layout.rows[-1].stop
 
     def find(self, index: int, point: Floats) -> Evaluation | None:
         """Return the evaluation of a (d,) point of the unit cube; None if there is none."""
@@ -97,23 +99,24 @@ class EvaluatorMemory:
         found = Evaluation(index, frozen_array(point), self._space.values(point))
         if len(numbers) == 1 and numbers[0] in range(count):
             return Evaluation(index, found.point, found.values, failure=entry.text, skipped=int(numbers[0]))
-        if len(numbers) != 2 * count + self._size:  # a stranger's entry
+        if len(numbers) != 2 * count + ERRORS + self._size:  # a stranger's entry
             return None
-        unsettled, scores, residuals = np.split(numbers, [count, 2 * count])
-        residuals = frozen_array(residuals)
+        unsettled, scores, errors, residuals = np.split(numbers, np.cumsum([count, count, ERRORS]))
         return Evaluation(
-            index, found.point, found.values, tuple(scores.tolist()), PointErrors.of(residuals), residuals,
+            index, found.point, found.values, tuple(scores.tolist()), PointErrors(*errors.tolist()),
+            frozen_array(residuals),
             tuple(trial.name for trial, one in zip(self._trials, unsettled, strict=True) if one))
 
     def add(self, evaluation: Evaluation) -> None:
         """Remember a finished evaluation."""
         if not self._base:
             return
-        if evaluation.residuals is None:
+        if evaluation.residuals is None or evaluation.errors is None:
             entry = Entry(np.array([float(evaluation.skipped)]), evaluation.failure)
         else:
             entry = Entry(np.concatenate([
-                _flags(self._trials, evaluation.unsettled), evaluation.scores, evaluation.residuals]))
+                _flags(self._trials, evaluation.unsettled), evaluation.scores, astuple(evaluation.errors),
+                evaluation.residuals]))
         self._memory.add(self._key(evaluation.point), entry)
 
     def _key(self, point: Floats) -> str:

@@ -45,7 +45,7 @@ class Examination:
     The outcome of an examination.
 
     :param uncertainty: of the parameters.
-    :param jacobian: (m, d) derivative of the residuals [m per unit cube].
+    :param jacobian: (m, d) derivative of the residuals at the compared goals [m per unit cube].
     :param regular: False if the search has not reached a minimum, so that `uncertainty` is not valid.
     :param noise: noise level: standard deviation of one measured coordinate, from the roughness of the
         chains [m]; nan if they have too few points.

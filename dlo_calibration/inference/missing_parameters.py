@@ -43,7 +43,7 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
     effect counts that the free parameters cannot imitate (a score test: Rao,
     Linear Statistical Inference and Its Applications, 1973, 6e.3).
 
-    :param evaluator: of the calibration.
+    :param evaluator: of the calibration; it compares the goals that `fit` does.
     :param fit: the residuals at the found parameters, linearised.
     :raises CancelledError: when stopped.
     """
@@ -52,7 +52,7 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
     left = perpendicular(weighted.jacobian, weighted.residuals)
     found = []
     for name, wider, moves in _candidates(evaluator.space):
-        wide = Evaluator(evaluator.trials, wider, evaluator.simulator)
+        wide = evaluator.of(wider)
         columns = []
         for move in moves:
             seen = wide.evaluate(0, np.concatenate([fit.point, move]), should_stop).residuals

@@ -194,7 +194,7 @@ def std_of_each_alone(trials: Sequence[Trial], examination: Examination) -> Floa
     """Return (T, d): the standard deviations in the unit cube that each calibrated trial would give alone."""
     scale, prior = examination.uncertainty.scale, prior_information(examination.jacobian.shape[1])
     return np.array([standard_deviations(information(examination.jacobian[rows], scale) + prior)
-                     for rows in ResidualLayout.of(trials).rows])
+                     for rows in ResidualLayout.compared(trials).rows])
 
 
 def uninformative(trials: Sequence[Trial], examination: Examination | None) -> tuple[str, ...]:

@@ -17,12 +17,14 @@ from toy_simulator import new_toy, toy_trial, ToySimulator
 
 from dlo_calibration import calibrate, Goal, InputError, SimulationError, Trial
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.evaluation.residuals import compared_goals
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import Rollout
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 65.0, 'friction': 25.0, 'self_collision': 55.0}
 TRIALS = (toy_trial(TRUTH), toy_trial(TRUTH, 'trial 2', turn=1.0))
+OPTIONS = Options(workers=1, engine='compiled')
 
 
 def search(space=None, seed=1, name='random'):
@@ -440,3 +442,32 @@ def test_threads_give_the_result_of_pybullet_bit_for_bit():
         elsewhere = found(trials=trials, simulator=bullet.BulletSimulator(**quick), budget=3,
                           executor=executor)
     same(here, elsewhere)
+
+
+def streamed(trial, frames=90):
+    """Return a trial with a stream of timed goals; one that no search compares lies 50 mm too high."""
+    chain, goals = trial.goals[0].chain, [k / 30 for k in range(1, frames + 1)]
+    one = replace(trial, goals=tuple(Goal(chain, time, stable=False) for time in goals))
+    wrong = min(set(range(frames)) - set(compared_goals(one)))
+    high = replace(chain, points=chain.points + (0, 0, 0.05))
+    return wrong, replace(one, goals=tuple(
+        replace(goal, chain=high) if k == wrong else goal for k, goal in enumerate(one.goals)))
+
+
+def test_a_few_goals_of_a_stream_are_fitted_and_every_one_is_judged():
+    wrong, first = streamed(TRIALS[0])
+    trials = (first, TRIALS[1])
+    told = []
+    result = calibrate(trials, OPTIONS, make_simulator=new_toy, on_evaluation=told.append)
+    assert result.values == pytest.approx(TRUTH, abs=0.5)
+    assert [chains.shape for chains in result.chains] == [(90, 11, 3), (1, 11, 3)]
+    assert result.errors.max == pytest.approx(0.05, abs=1e-3)  # that of the goal that was not fitted
+    apart = np.linalg.norm(result.chains[0] - [goal.chain.points for goal in first.goals], axis=2)
+    assert apart.mean(axis=1).argmax() == wrong
+    assert result.errors.mean == pytest.approx(np.mean([*apart.ravel(), *np.linalg.norm(
+        result.chains[1][0] - trials[1].goals[0].chain.points, axis=1)]))
+    assert min(one.errors.max for one in told) > 0.04
+    assert result.examination.band.shape == (91 * 11,)
+    # The same goals, without those that are not compared, give the same parameters.
+    few = replace(first, goals=tuple(first.goals[k] for k in compared_goals(first)))
+    assert calibrate((few, TRIALS[1]), OPTIONS, make_simulator=new_toy).values == result.values

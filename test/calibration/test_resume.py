@@ -17,6 +17,7 @@ CHOICES = {
     'least squares': {'evaluations': 40},
     'random': {'search': 'random', 'evaluations': 20},
     'cma-es': {'search': 'cma_es', 'evaluations': 25, 'calibrate': ['flexibility', 'friction']},
+    'stream': {'evaluations': 30},
     'parts': {'parts': 0, 'evaluations': 60, 'calibrate': ['flexibility', 'friction']},
 }
 
@@ -55,10 +56,18 @@ def options_of(name, workers=1):
     return Options.of({'workers': workers, **CHOICES[name]})
 
 
+def trials_of(name):
+    trials = toy_trials(3)
+    if name == 'stream':
+        goals = [replace(trials[0].goals[0], time=2 + k / 50, stable=False) for k in range(60)]
+        trials[0] = replace(trials[0], goals=tuple(goals))
+    return trials
+
+
 @pytest.mark.parametrize('name', CHOICES)
 def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
     """It is killed in the search, in the examination, while it advises and while another engine confirms."""
-    options, trials, whole = options_of(name), toy_trials(3), Engines()
+    options, trials, whole = options_of(name), trials_of(name), Engines()
     expected = told(calibrate(trials, options, make_simulator=whole))
     assert len(whole.made) == 2
     path = tmp_path / 'log'

@@ -3,6 +3,7 @@
 
 """The log of evaluations: what survives, and what a damaged or a stranger's one does."""
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import subprocess
@@ -59,6 +60,17 @@ def test_evaluations_come_back_bit_for_bit_failed_ones_too(path, evaluator):
     found = write(path, evaluator)
     assert {bool(one.failure) for one in found} == {True, False}
     assert all(map(same, remembered(path, evaluator), found))
+
+
+def test_an_evaluation_of_a_stream_comes_back_with_the_errors_of_every_goal(path):
+    trial, = toy_trials(1)
+    goals = [replace(trial.goals[0], time=2 + k / 100, stable=False) for k in range(100)]
+    streamed = replace(trial, goals=tuple(goals))
+    evaluator = Evaluator([streamed], ParameterSpace(), ToySimulator(), every_goal=False)
+    found = write(path, evaluator)
+    assert all(map(same, remembered(path, evaluator), found))
+    every = Evaluator([streamed], ParameterSpace(), ToySimulator())
+    assert remembered(path, every) == [None] * 5  # its residuals are others
 
 
 def test_another_trial_space_engine_or_point_is_not_in_it(path, evaluator):

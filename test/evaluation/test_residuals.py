@@ -3,14 +3,22 @@
 
 """The flat residual vector is seen by trial, goal and point."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Goal
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.residuals import (
+    at_every_goal,
+    compared_goals,
+    compared_rows,
+    MOST_TIMED,
+    ResidualLayout,
+)
 from dlo_calibration.model.parameters import ParameterSpace
 
 TRUTH = {'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0}
@@ -35,3 +43,63 @@ def test_the_folds_of_a_cross_validation_are_neighbouring_trials_that_cover_all(
     first, _, last = layout.by_point(np.arange(13))
     assert first.tolist() == [[0, 1, 2]]
     assert last.tolist() == [[9, 10, 11, 12]]
+
+
+def moving(trial, times, stable=()):
+    """Return a trial with other goals: one at each time, timed unless `stable` has the time."""
+    chain = trial.goals[0].chain
+    return replace(trial, goals=tuple(Goal(chain, time, stable=time in stable) for time in times))
+
+
+def stream():
+    """Return two trials: a stream of 200 timed goals that ends at rest, and one goal at rest."""
+    first, second = (toy_trial(TRUTH, name, n=n) for name, n in (('trial 1', 11), ('trial 2', 7)))
+    return moving(first, [0.51 + 0.01 * k for k in range(200)] + [4.0, 5.0], stable=(4.0, 5.0)), second
+
+
+def test_few_goals_are_all_compared():
+    trial = toy_trial(TRUTH)
+    for times, stable in (((2.0,), (2.0,)), (np.linspace(2, 3, MOST_TIMED).tolist(), ()),
+                          (np.linspace(2, 3, 90).tolist(), np.linspace(2, 3, 90).tolist()[MOST_TIMED:])):
+        assert compared_goals(moving(trial, times, stable)) == list(range(len(times)))
+    assert compared_rows([trial, trial]) is None
+
+
+def test_of_a_stream_a_few_goals_evenly_spread_over_time_are_compared():
+    trial, _ = stream()
+    goals = compared_goals(trial)
+    assert len(goals) == MOST_TIMED + 2
+    assert goals[0] == 0
+    assert goals[-3:] == [199, 200, 201]  # the last in motion, and both at rest
+    assert set(np.diff(goals[:-2])) == {8, 9}
+    # Twice as many frames in the second half: time counts, not their number.
+    uneven = moving(trial, [*np.arange(100) / 10, *np.arange(10, 20, 0.05)])
+    compared = np.array([uneven.goals[k].time for k in compared_goals(uneven)])
+    assert compared == pytest.approx(np.linspace(0, 19.95, MOST_TIMED), abs=0.051)
+
+
+def test_scores_and_errors_are_those_of_every_goal_residuals_those_of_the_compared_ones():
+    trials, point = stream(), np.full(4, 0.3)
+    whole = Evaluator(trials, ParameterSpace(), ToySimulator()).evaluate(0, point)
+    evaluator = Evaluator(trials, ParameterSpace(), ToySimulator(), every_goal=False)
+    for one in (evaluator, copy.copy(evaluator), evaluator.of(evaluator.space)):
+        thin = one.evaluate(0, point)
+        assert thin.scores == whole.scores
+        assert thin.errors == whole.errors
+        expected = [block[compared_goals(trial)] for trial, block in zip(
+            trials, ResidualLayout.of(trials).chains(whole.residuals), strict=True)]
+        found = ResidualLayout.compared(trials).chains(thin.residuals)
+        assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
+
+
+def test_between_compared_goals_a_value_is_interpolated_in_time():
+    trials = stream()
+    value = [np.array([goal.time for goal in trial.goals]) for trial in trials]  # linear in time
+    shown = np.concatenate([np.repeat(times[compared_goals(trial)], len(trial.initial))
+                            for times, trial in zip(value, trials, strict=True)])
+    every = np.concatenate([np.repeat(times, len(trial.initial))
+                            for times, trial in zip(value, trials, strict=True)])
+    assert at_every_goal(shown, trials) == pytest.approx(every)
+    few = (toy_trial(TRUTH), toy_trial(TRUTH))
+    values = np.random.default_rng(0).random(22)
+    assert np.array_equal(at_every_goal(values, few), values)
