@@ -22,7 +22,7 @@ from dlo_calibration.calibration.parts import fit_parts
 from dlo_calibration.calibration.prior import Prior, prior
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.calibration.stages import advised, confirmed, with_missing_parameters
+from dlo_calibration.calibration.stages import advised, confirmed, confirming, with_missing_parameters
 from dlo_calibration.calibration.surroundings import examined
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
@@ -81,9 +81,10 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
         result = fitted(setting)
+        ahead = confirming(result, options, make_simulator, None if options.scheduler else executor)
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
-    result = confirmed(result, options, make_simulator, should_stop, memory)
+        result = confirmed(result, options, make_simulator, should_stop, memory, ahead)
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     return replace(result, choice=choice, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Executor
 from contextlib import closing
 from dataclasses import replace
 import time
@@ -18,6 +18,7 @@ from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import DloCalibrationError, SimulationError
+from dlo_calibration.evaluation.ahead import SimulatedAhead
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.memory import Memory
@@ -59,9 +60,30 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
         return result
 
 
+def confirming(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
+               executor: Executor | None) -> SimulatedAhead | None:
+    """
+    Begin to simulate what `confirmed` needs, while other stages keep only this thread busy.
+
+    :param executor: processes on this machine; None: nothing is begun.
+    :return: None if nothing is begun; `confirmed` then simulates, or says why it cannot.
+    """
+    if executor is None or options.engine != AUTO or result.engine == CONFIRMING:
+        return None
+    try:
+        simulator = make_simulator(replace(options, engine=CONFIRMING))
+    except Exception:
+        return None
+    if simulator.name == result.engine:
+        simulator.close()
+        return None
+    return SimulatedAhead(simulator, executor, result.trials,
+                          result.space.physical(result.best.values, result.length))
+
+
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
-              should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None
-              ) -> CalibrationResult:
+              should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None,
+              ahead: SimulatedAhead | None = None) -> CalibrationResult:
     """
     Return a result with the confirmation by a second engine, if `options` name none (auto).
 
@@ -69,6 +91,7 @@ def confirmed(result: CalibrationResult, options: Options, make_simulator: Simul
     warning.
 
     :param memory: what was simulated before an interruption; None: nothing.
+    :param ahead: the second engine, already under way (`confirming`); None: it is made, and simulates here.
     """
     if options.engine != AUTO or result.engine == CONFIRMING:
         return result
@@ -78,7 +101,7 @@ def confirmed(result: CalibrationResult, options: Options, make_simulator: Simul
         return should_stop() and time.monotonic() - begun > STOPPED_PATIENCE
 
     try:
-        with closing(make_simulator(replace(options, engine=CONFIRMING))) as simulator:
+        with closing(ahead or make_simulator(replace(options, engine=CONFIRMING))) as simulator:
             if simulator.name == result.engine:
                 return result
             return _confirmed(result, (memory or Memory()).simulator(simulator), late)

@@ -3,7 +3,9 @@
 
 """A second engine that confirms what a first one found."""
 
+from concurrent.futures import ThreadPoolExecutor
 import json
+import threading
 
 from fitting import fitted
 import numpy as np
@@ -15,7 +17,7 @@ from toy_simulator import ToySimulator
 from dlo_calibration import calibrate, SimulationError
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.plain import plain
-from dlo_calibration.calibration.stages import confirmed
+from dlo_calibration.calibration.stages import confirmed, confirming
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.inference.confirmation import disagreements
@@ -74,6 +76,34 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.score == pytest.approx(np.mean(other.scores))
     residual = np.concatenate([residuals(*one) for one in zip(after.trials, moved, strict=True)])
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
+
+
+class Elsewhere(SecondToy):
+    """It may simulate in another thread only."""
+
+    home = threading.get_ident()
+
+    def simulate(self, trial, physical):
+        assert threading.get_ident() != self.home
+        return super().simulate(trial, physical)
+
+
+@pytest.mark.parametrize('failure', [None, SimulationError('the rollout diverged')])
+def test_beside_other_stages_other_processes_confirm_to_the_same_figures(failure):
+    before, expected = found(SecondToy(0.004, failure=failure))
+    make = engines(Elsewhere(0.004, failure=failure))
+    with ThreadPoolExecutor(2) as executor:
+        after = confirmed(before, OPTIONS, make, ahead=confirming(before, OPTIONS, make, executor))
+    assert after.confirmation == expected.confirmation
+    assert after.warnings == expected.warnings
+
+
+def test_nothing_is_begun_where_there_is_nothing_to_confirm():
+    before, _ = found(SecondToy())
+    with ThreadPoolExecutor(1) as executor:
+        assert confirming(before, OPTIONS, engines(SecondToy()), None) is None
+        assert confirming(before, Options(engine='compiled'), engines(SecondToy()), executor) is None
+        assert confirming(before, OPTIONS, engines(ToySimulator()), executor) is None
 
 
 def test_it_costs_no_evaluation():
