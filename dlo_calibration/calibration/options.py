@@ -155,8 +155,9 @@ class Options(DeclaredOptions):
         Where `calibrate` is auto, these are the paper's parameters, which it always finds; `automatic.choose`
         adds those that the trials show.
         """
-        parts = max(self.parts, ParameterSpace(self._names).parts)
-        return ParameterSpace(self._names, self.values, self.mass).divided(parts)
+        named = ParameterSpace(self._names)
+        return ParameterSpace(self._names, self.values, self.mass).divided(
+            max(self.parts, named.parts)).shaped(named.knots)
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -14,7 +14,15 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation, perpendicular
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME, Parameter, PARAMETERS, ParameterSpace, PART_NAMES, SCALE
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    Parameter,
+    PARAMETERS,
+    ParameterSpace,
+    PART_NAMES,
+    REST_SHAPE,
+    SCALE,
+)
 
 PARTS = 'parts'  # stands for parts of different bending stiffness
 MOVE = 0.15  # change of a parameter, in the unit cube: well above the noise of a simulation
@@ -68,7 +76,8 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
     """Yield each name, the space with its a parameters added, and k values (k, a) to try in the unit cube."""
     for parameter in PARAMETERS:
         name = parameter.name
-        if name in space.free or name in PART_NAMES or name == 'mass' and not space.mass_known:
+        absent = name in (*PART_NAMES, *REST_SHAPE) or name == 'mass' and not space.mass_known
+        if name in space.free or absent:
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE

@@ -11,7 +11,7 @@ an engine reads its physical value by name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from typing import Mapping, Sequence
 
@@ -71,11 +71,17 @@ class Parameter:
 
 
 MOST_PARTS = 8  # with bending stiffnesses of their own: the DLO can be halved three times
+KNOTS = (3, 5, 9)  # of a rest shape that varies: each has the places of the one before and those between
 
 
 def part_name(part: int) -> str:
     """Return the name of the stiffness of a part of the DLO, counted from 1; part 1 has `flexibility`."""
     return 'flexibility' if part == 1 else f'stiffness_{part}'
+
+
+def knot_names(knots: int) -> tuple[str, ...]:
+    """Return the names of both components of the natural curvature at knots 1 to `knots`."""
+    return tuple(f'rest_curvature_{axis}{knot}' for knot in range(1, knots + 1) for axis in 'xy')
 
 
 #: The paper's four, then those that are fixed by default.
@@ -102,13 +108,29 @@ PARAMETERS: tuple[Parameter, ...] = (
               neutral=0.0),
     Parameter('torsion', 'ratio of twisting stiffness GJ to bending stiffness EI', '1', 1e-2, 1e1, 0.0,
               'how much the DLO resists twist between two clamps (0: not at all)', neutral=0.0),
+    Parameter('bending_friction', 'largest moment of friction inside the DLO, relative to EI', '1/m', 1e-2,
+              1e2, 0.0, 'how much of a bend the DLO keeps, by friction between its strands', neutral=0.0),
+    Parameter('bending_slip', 'change of curvature at which the strands slip', '1/m', 1e-3, 1e1, 50.0,
+              'how far the DLO bends before its strands slip (no effect without bending_friction)'),
     *(Parameter(part_name(part), f'bending stiffness of part {part} relative to part 1', '1', 0.02, 50.0,
                 50.0, f'how stiff part {part} of the DLO is (see parts)', neutral=1.0)
       for part in range(2, MOST_PARTS + 1)),
+    Parameter('clamp_twist', 'angle between rest shape and second clamp', 'rad', -2 * math.pi, 2 * math.pi,
+              50.0, 'how the DLO was turned about its axis when it was put into the second clamp (see parts)',
+              linear=True, neutral=0.0),
+    *(Parameter(name, f'component {name[-2]} of the curvature of the rest shape at knot {name[-1]}', '1/m',
+                -25.0, 25.0, 50.0, 'how curved the DLO is there when nothing bends it (see parts)',
+                linear=True, neutral=0.0) for name in knot_names(KNOTS[-1])),
 )
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
 PART_NAMES = tuple(part_name(part) for part in range(2, MOST_PARTS + 1))
+REST_SHAPE = ('clamp_twist', *knot_names(KNOTS[-1]))
 PAPER_PARAMETERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
+
+
+def _absent_knots(knots: int) -> tuple[str, ...]:
+    """Return the names of the rest shape's parameters that a DLO with that number of knots does not have."""
+    return REST_SHAPE[1 + 2 * knots:] if knots else REST_SHAPE
 
 
 @dataclass(frozen=True)
@@ -117,7 +139,8 @@ class ParameterSpace:
     The parameters that a calibration finds, and the values of the others.
 
     The DLO has k parts of equal length where `stiffness_k` is the highest such name
-    that is free or fixed; it has one part where there is none.
+    that is free or fixed; it has one part where there is none. Likewise, its rest shape
+    has the number of knots of `KNOTS` that the highest such name needs.
 
     :param free: names of the parameters to find, in order.
     :param fixed: values of others on the 0..100 scale; the rest keep their defaults.
@@ -156,9 +179,17 @@ class ParameterSpace:
                     if part == 1 or part_name(part) in (*self.free, *self.fixed)))
 
     @property
+    def knots(self) -> int:
+        """Number of knots of the rest shape, of `KNOTS`; 0: it is straight, or `natural_curvature` is all."""
+        present = {*self.free, *self.fixed}
+        if not present.intersection(REST_SHAPE):
+            return 0
+        return next(knots for knots in KNOTS if present.isdisjoint(REST_SHAPE[1 + 2 * knots:]))
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The entries of PARAMETERS, without the stiffnesses of parts that this DLO does not have."""
-        absent = PART_NAMES[self.parts - 1:]
+        """The entries of PARAMETERS, without those of parts and knots that this DLO does not have."""
+        absent = {*PART_NAMES[self.parts - 1:], *_absent_knots(self.knots)}
         return tuple(parameter for parameter in PARAMETERS if parameter.name not in absent)
 
     def divided(self, parts: int) -> ParameterSpace:
@@ -186,6 +217,28 @@ class ParameterSpace:
             values[part_name(part)] = BY_NAME[part_name(part)].default if whole == 'flexibility' else \
                 self.fixed.get(whole, self.values(point).get(whole, BY_NAME[whole].default))
         return space, space.point(values)
+
+    def shaped(self, knots: int) -> ParameterSpace:
+        """Return the space of a DLO whose rest shape has `knots` knots, all free; 0: none."""
+        absent = _absent_knots(knots)
+        free = tuple(name for name in self.free if name not in absent)
+        fixed = {name: value for name, value in self.fixed.items() if name not in absent}
+        if knots:
+            free += tuple(name for name in REST_SHAPE[:1 + 2 * knots] if name not in (*free, *fixed))
+        return ParameterSpace(free, fixed, self.mass)
+
+    def with_knots(self, knots: int, point: Sequence[float] | Floats
+                   ) -> tuple[ParameterSpace, NDArray[np.float64]]:
+        """Return the space with more knots, all free, and its point for the DLO at the (d,) `point`."""
+        values, now = {**self.fixed, **self.values(point)}, self.knots
+        space = replace(self, fixed={name: value for name, value in self.fixed.items()
+                                     if name not in REST_SHAPE}).shaped(knots)
+        for axis in 'xy' if now else '':
+            names = [f'rest_curvature_{axis}{knot}' for knot in range(1, knots + 1)]
+            known = [values.get(name, BY_NAME[name].default) for name in names[:now]]
+            between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, now), known)
+            values.update(zip(names, between.tolist(), strict=True))
+        return space, space.point({name: values.get(name, BY_NAME[name].default) for name in space.free})
 
     @property
     def mass_known(self) -> bool:

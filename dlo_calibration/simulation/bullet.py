@@ -71,13 +71,16 @@ class BulletRope:
     :param radius: [m] for contact with other bodies; None: the self-collision radius.
     :param velocities: (N, 3) [m/s] at the start; None: at rest.
     :param features: (N,) number of points annotated as feature at each node; None: there are none.
+    :param directions: (N - 1, 3) unit vectors across the segments in clamps that hold from the start, to
+        which the rest shape belongs, nan elsewhere; None: unknown.
     :param group: collision group, one bit; its bodies do not touch each other in Bullet.  Two
         ropes that should touch each other need different groups.
     """
 
     def __init__(self, client: int, places: Floats, points: Floats, physical: Mapping[str, float], *,
                  radius: float | None = None, velocities: Floats | None = None,
-                 features: Floats | None = None, group: int = 1 << 6) -> None:
+                 features: Floats | None = None, directions: Floats | None = None, group: int = 1 << 6
+                 ) -> None:
         self._client = client
         world = pybullet.getPhysicsEngineParameters(physicsClientId=client)
         self.time_step: float = world['fixedTimeStep']
@@ -93,7 +96,7 @@ class BulletRope:
             for point in np.asarray(points, dtype=float))
         for body in self.bodies:
             pybullet.setCollisionFilterGroupMask(body, -1, group, ~group, physicsClientId=client)
-        self.reset(places, points, physical, velocities, features)
+        self.reset(places, points, physical, velocities, features, directions)
 
     @classmethod
     def of(cls, client: int, chain: Chain, physical: Mapping[str, float], *, nodes: int = DEFAULT_NODES,
@@ -104,11 +107,13 @@ class BulletRope:
         return cls(client, places, chain.resample(places), physical, **rest)
 
     def reset(self, places: Floats, points: Floats, physical: Mapping[str, float],
-              velocities: Floats | None = None, features: Floats | None = None) -> None:
+              velocities: Floats | None = None, features: Floats | None = None,
+              directions: Floats | None = None) -> None:
         """Start again with other properties, but with the same bodies in the world."""
         assert len(places) == len(points) == len(self.bodies)
         velocities = np.zeros((len(places), 3)) if velocities is None else velocities
-        self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features)
+        self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features,
+                          directions)
         state = self._rope.state
         for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
             pybullet.changeDynamics(
@@ -128,24 +133,32 @@ class BulletRope:
         self._rope.hold(tuple(dict.fromkeys(int(node) for node in nodes)))
         self._targets = self._rope.state.points[self._rope.state.rod.held]
 
-    def step(self, targets: Floats | None = None) -> None:
+    @property
+    def twists(self) -> bool:
+        """Whether it makes a difference how clamps turn about the axis of the DLO."""
+        return self._rope.twists
+
+    def step(self, targets: Floats | None = None, turns: Floats | None = None) -> None:
         """Take one step of the whole world; see `before_step`."""
-        self.before_step(targets)
+        self.before_step(targets, turns)
         pybullet.stepSimulation(physicsClientId=self._client)
         self.after_step()
 
-    def before_step(self, targets: Floats | None = None) -> None:
+    def before_step(self, targets: Floats | None = None, turns: Floats | None = None) -> None:
         """
         Give the nodes the velocities due to internal forces, gravity and self-contact.
 
         :param targets: (h, 3) [m] positions of the held nodes after the step;
             None: they stay.
+        :param turns: (h, 9) rotation matrices, row by row, by which the clamps that hold the nodes turn in
+            this step; None: a clamp turns with its segment, and not about it.
         :raises SimulationError: if the rollout diverges.
         """
         state = self._rope.state
         if targets is not None:
             self._targets = np.array(targets, dtype=float)
-        if not kernels.predict_velocities(state, self._targets):
+        turned = np.empty((0, 0)) if turns is None else np.ascontiguousarray(turns, dtype=float)
+        if not kernels.predict_velocities(state, self._targets, turned):
             raise diverged()
         sent = state.predicted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client
@@ -164,14 +177,10 @@ class BulletRope:
         state.support[:] = state.velocities - state.predicted
         state.points[:] = points
 
-    def advance(self, targets: Floats, path: Floats | None = None) -> None:
-        """
-        Take k steps; `targets` are the (k, h, 3) [m] positions of the held nodes after each.
-
-        :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
-        """
+    def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
+        """Take k steps; see `rollout.Stepper.advance`."""
         for k, target in enumerate(targets):
-            self.step(target)
+            self.step(target, None if turns is None else turns[k])
             advanced()
             if path is not None:
                 path[k] = self._rope.state.points
@@ -319,7 +328,8 @@ class _World:
             self._rope.reset(layout.places, points + (0, 0, -self.AWAY), physical)
         pybullet.stepSimulation(physicsClientId=self._client)
         self._place_table(height)
-        self._rope.reset(layout.places, points, physical, layout.velocities, layout.features)
+        self._rope.reset(layout.places, points, physical, layout.velocities, layout.features,
+                         layout.directions)
         return self._rope
 
     def _place_table(self, height: float) -> None:

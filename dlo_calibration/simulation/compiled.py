@@ -30,21 +30,23 @@ class CompiledRope(Rope):
     """
 
     def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
-                 time_step: float, level: float | None = None, features: Floats | None = None) -> None:
+                 time_step: float, level: float | None = None, features: Floats | None = None,
+                 directions: Floats | None = None) -> None:
         super().__init__(places, points, velocities, physical, time_step, np.array([0.0, 0.0, -GRAVITY]),
-                         features)
+                         features, directions)
         self.time_step = time_step
         self._level = -1e6 if level is None else level  # so low that nothing touches it
 
-    def advance(self, targets: Floats, path: Floats | None = None) -> None:
+    def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
         """
-        Take k steps; `targets` are the (k, h, 3) [m] positions of the held nodes after each.
+        Take k steps; see `rollout.Stepper.advance`.
 
-        :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
         :raises SimulationError: if the rollout diverges.
         """
         path = np.empty((0, 0, 3)) if path is None else path
-        if kernels.advance(self.state, np.ascontiguousarray(targets), self._level, path) < len(targets):
+        turns = np.empty((0, 0, 9)) if turns is None else np.ascontiguousarray(turns)
+        targets = np.ascontiguousarray(targets)
+        if kernels.advance(self.state, targets, turns, self._level, path) < len(targets):
             raise diverged()
 
 
@@ -56,4 +58,4 @@ class CompiledSimulator(Engine):
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> CompiledRope:
         return CompiledRope(layout.places, points, layout.velocities, physical, self._time_step, level,
-                            layout.features)
+                            layout.features, layout.directions)

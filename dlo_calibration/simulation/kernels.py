@@ -28,7 +28,6 @@ Vector = Floats
 Matrix = Floats
 Cube = Floats
 Indices = NDArray[np.int64]
-Spans = NDArray[np.void]
 Contacts = NDArray[np.void]
 IndexRows = NDArray[np.int64]
 #: annotation -> the type that a kernel is compiled for
@@ -39,6 +38,9 @@ TYPES: dict[str, Any] = {
 
 HELD = 1e12  # weight of the equation that gives a held node its velocity, relative to its mass
 ROUNDED = 0.05  # rad; mean bend below which the energy of natural curvature is rounded off
+STEADY = 0.01  # rad; where the bends are smaller than this, natural curvature turns the frame slowly
+REACH = 0.2  # rad; most that the material frame turns in a step
+FIRST_TURNS = 30  # iterations for the angles at the start; later, one in each step does
 HAIRPIN = 0.01  # least squared cosine of half the angle between two segments: limits divisions
 TINY = 1e-12  # m or m/s; shorter vectors have no direction
 
@@ -79,15 +81,6 @@ def _compiled(kernel: Kernel) -> Kernel:
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-#: the part of a DLO between two clamps, which resists twist
-SPAN = np.dtype([
-    ('first', 'i8'), ('last', 'i8'),  # segments that the clamps hold
-    ('stiffness', 'f8'),  # torque per angle [N m]
-    ('angle', 'f8'),  # twist [rad]
-    ('begun', 'i8'),  # 1 if it has been stepped since the clamps closed, else 0
-    ('start', 'f8', 3), ('start_frame', 'f8', 3),  # unit vectors along and across `first` at that time
-    ('end', 'f8', 3), ('end_frame', 'f8', 3)], align=True)  # and of `last`
-
 #: two segments that touch each other
 CONTACT = np.dtype([
     ('nodes', 'i8', 4),  # ends of the first and of the second segment
@@ -99,7 +92,60 @@ CONTACT = np.dtype([
     ('pushed', 'f8'), ('rubbed', 'f8', 3),  # total impulses along and across the normal [N s]
     ('impulse', 'f8', 3)], align=True)  # of the current iteration [N s]
 
-TYPES['Spans'], TYPES['Contacts'] = numba.from_dtype(SPAN)[::1], numba.from_dtype(CONTACT)[::1]
+TYPES['Contacts'] = numba.from_dtype(CONTACT)[::1]
+
+
+@_record
+class FrameState(NamedTuple):
+    """
+    The material frame of N - 1 segments, which carries the rest shape and resists twist; see `rod`.
+
+    :param natural: (N - 2, 3) [N m] EI times natural curvature at each inner node, in two directions, and the
+        length of that vector.
+    :param twisting: (N - 2,) [N m] torque per angle between the two segments at each inner node; (0,): the
+        DLO does not twist, and turns freely as a whole.
+    :param angles: (N - 1,) [rad] from a frame that is carried along without twist; (0,): there is none.
+    :param clamped: (s, 2) segments that clamps keep from turning, in order, and which of the held nodes tells
+        how each of them turns.
+    :param clamps: (s, 7) a unit vector of the material frame in each clamp, nan: unknown; the unit
+        tangent there, nan: unknown; and how far [rad] the segment must turn now.
+    :param carried: (3, 3) unit tangent of the first segment in the last step, a unit vector across it, and
+        workspace.
+    :param begun: (1,) 1 once the angles are in equilibrium.
+    :param segments: (N - 1, 7) workspace: unit tangents, inverse lengths [1/m], and unit vectors across.
+    :param joints: (N - 2, 6) bends in two directions across, inverse cosine of half the bending angle, cosine
+        and sine of the mean angle, and twisting moment [N m].
+    :param turning: (N - 1, 2) workspace.
+    """
+
+    natural: Matrix
+    twisting: Vector
+    angles: Vector
+    clamped: IndexRows
+    clamps: Matrix
+    carried: Matrix
+    begun: Indices
+    segments: Matrix
+    joints: Matrix
+    turning: Matrix
+
+
+@_record
+class SlipState(NamedTuple):
+    """
+    Friction between the strands of a DLO: an elastic, perfectly plastic element at each inner node.
+
+    :param rows: (N - 2, 5) curvature from three nodes [1/m]: multiplied by the points it gives
+        t_i - t_(i-1); stiffness [N m] and the change of t_i - t_(i-1) at which the strands slip.  (0, 5):
+        there is no such friction.
+    :param kept: (N - 2, 6) t_i - t_(i-1) at which the element is free of stress, and the mean unit tangents
+        in the last step.
+    :param begun: (1,) 1 once `kept` is known.
+    """
+
+    rows: Matrix
+    kept: Matrix
+    begun: Indices
 
 
 @_record
@@ -112,8 +158,8 @@ class RodState(NamedTuple):
     :param masses: (N,) [kg].
     :param inverse_masses: (N,) [1/kg], 0 for held nodes.
     :param bending: (3, N) [N/m] bending matrix: its diagonal and the two below.
-    :param natural: (N - 2,) [N m] EI times natural curvature at each inner node; (0,): a straight rest shape.
-    :param spans: (s,) of `SPAN`: the parts that resist twist.
+    :param frame: the material frame.
+    :param friction: hysteresis of bending.
     :param held: (h,) nodes that follow given velocities.
     :param follow: (h, 3) [m/s] velocities of the held nodes.
     :param drag: acceleration against the velocity [1/s].
@@ -128,8 +174,8 @@ class RodState(NamedTuple):
     masses: Vector
     inverse_masses: Vector
     bending: Matrix
-    natural: Vector
-    spans: Spans
+    frame: FrameState
+    friction: SlipState
     held: Indices
     follow: Matrix
     drag: float
@@ -249,17 +295,6 @@ def _transport(frame: Vector, before: Vector, tangent: Vector) -> None:
 
 
 @_part
-def _tangents(points: Matrix, tangents: Matrix, lengths: Vector) -> None:
-    """Write the (n, 3) unit tangents of the segments and their (n,) lengths [m]."""
-    for i in range(len(lengths)):
-        for c in range(3):
-            tangents[i, c] = points[i + 1, c] - points[i, c]
-        lengths[i] = math.sqrt(tangents[i, 0]**2 + tangents[i, 1]**2 + tangents[i, 2]**2)
-        for c in range(3):
-            tangents[i, c] /= lengths[i]
-
-
-@_part
 def _perpendicular(tangent: Vector, frame: Vector) -> None:
     """Write to `frame` (3,) a unit vector perpendicular to a (3,) tangent."""
     least = 0
@@ -272,159 +307,347 @@ def _perpendicular(tangent: Vector, frame: Vector) -> None:
 
 
 @_part
-def _add_couples(torques: Matrix, tangents: Matrix, lengths: Vector, step: float, right: Vector) -> None:
-    """Add to `right` the impulses [N s] at the segments' ends that are equal to (n, 3) torques [N m]."""
-    for i in range(len(lengths)):
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            impulse = step * (torques[i, d] * tangents[i, e] - torques[i, e] * tangents[i, d]) / lengths[i]
-            right[3 * i + 3 + c] += impulse
-            right[3 * i + c] -= impulse
+def _carry_along(segments: Matrix, joints: Matrix, carried: Matrix, begun: bool) -> None:
+    """Carry the reference frame along the DLO without twist, and write the bends in its directions."""
+    for c in range(3):
+        carried[2, c] = segments[0, c]
+    if begun:
+        _transport(carried[1], carried[0], carried[2])
+    else:
+        _perpendicular(carried[2], carried[1])
+    a0, a1, a2 = carried[2, 0], carried[2, 1], carried[2, 2]
+    u0, u1, u2 = carried[1, 0], carried[1, 1], carried[1, 2]
+    carried[0, 0], carried[0, 1], carried[0, 2] = a0, a1, a2
+    for i in range(len(joints)):
+        segments[i, 4], segments[i, 5], segments[i, 6] = u0, u1, u2
+        b0, b1, b2 = segments[i + 1, 0], segments[i + 1, 1], segments[i + 1, 2]
+        square = (1.0 + a0 * b0 + a1 * b1 + a2 * b2) / 2
+        hairpin = square < HAIRPIN
+        if hairpin:
+            square = HAIRPIN
+        half = math.sqrt(square)
+        inverse = 1.0 / half
+        x = (b0 * u0 + b1 * u1 + b2 * u2) * inverse
+        y = (b0 * (a1 * u2 - a2 * u1) + b1 * (a2 * u0 - a0 * u2) + b2 * (a0 * u1 - a1 * u0)) * inverse
+        joints[i, 0], joints[i, 1], joints[i, 2] = x, y, inverse
+        share = x * inverse / 2
+        u0 -= share * (a0 + b0)
+        u1 -= share * (a1 + b1)
+        u2 -= share * (a2 + b2)
+        a0, a1, a2 = b0, b1, b2
+        if hairpin:  # the rotation was not quite one
+            left = u0 * a0 + u1 * a1 + u2 * a2
+            u0, u1, u2 = u0 - left * a0, u1 - left * a1, u2 - left * a2
+            left = 1.0 / math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+            u0, u1, u2 = left * u0, left * u1, left * u2
+    last = len(joints)
+    segments[last, 4], segments[last, 5], segments[last, 6] = u0, u1, u2
 
 
 @_part
-def add_natural(points: Matrix, moments: Vector, step: float, right: Vector) -> None:
+def _angle_of(segments: Matrix, segment: int, direction: Vector, near: float) -> float:
+    """Return the angle [rad] of a (3,) direction across a segment, in the turn that is next to `near`."""
+    t0, t1, t2 = segments[segment, 0], segments[segment, 1], segments[segment, 2]
+    u0, u1, u2 = segments[segment, 4], segments[segment, 5], segments[segment, 6]
+    d0, d1, d2 = direction[0], direction[1], direction[2]
+    angle = math.atan2(t0 * (u1 * d2 - u2 * d1) + t1 * (u2 * d0 - u0 * d2) + t2 * (u0 * d1 - u1 * d0),
+                       u0 * d0 + u1 * d1 + u2 * d2)
+    return angle + 2 * math.pi * round((near - angle) / (2 * math.pi))
+
+
+@_part
+def _mean_direction(natural: Matrix, joints: Matrix) -> tuple[float, float]:
+    """Return the bends [N m] in the directions of the natural curvature and across: sums over all joints."""
+    one, two = 0.0, 0.0
+    for i in range(len(natural)):
+        one += natural[i, 0] * joints[i, 0] + natural[i, 1] * joints[i, 1]
+        two += natural[i, 0] * joints[i, 1] - natural[i, 1] * joints[i, 0]
+    return one, two
+
+
+@_part
+def _turn_freely(natural: Matrix, joints: Matrix) -> None:
     """
-    Add to `right` (3 N,) the impulses [N s] of a DLO with a curved rest shape.
+    Turn the frame as a whole to the least energy, and find the twisting moments.
 
-    With natural curvature k the bending energy of inner node i is
-    ``EI / (2 l) |t_i - t_(i-1) - k l d_i|^2``.  There, l is the length that the node
-    stands for, and d_i the direction of the curvature at rest: a unit vector of a frame
-    without twist (Bishop, There is more than one way to frame a curve, 1975;
-    transported from segment to segment as in Bergou et al., Discrete Elastic Rods,
-    2008, 4.2).  Of the square, the first term is the energy of a straight DLO and the
-    last one is constant.  The mixed term remains:
-
-        -k EI g_i,    g_i = 2 sin(angle_i / 2) cos(angle from d_i to the plane of the bend)
-
-    The frame as a whole turns freely about the DLO to the least energy, because a
-    DLO has almost no inertia about its axis and the grips do not tell in which
-    direction it was coiled.  With a and b the sums of ``k EI g_i`` for two perpendicular
-    d, the least energy is ``-sqrt(a^2 + b^2)``.  It has a cusp where the DLO is
+    With a and b of `_mean_direction`, the energy is ``-sqrt(a^2 + b^2)``.  It has a cusp where the DLO is
     straight; `ROUNDED` rounds it off.
-
-    The forces are the exact gradient of this energy.  A segment has no inertia about its
-    axis, so the torques of its two joints about the axis cancel; the twisting moments of
-    the joints follow from that.  A couple of forces at the segment's ends replaces the
-    rest of the torque.
-
-    :param moments: (N - 2,) [N m] EI times natural curvature at each inner node.
     """
-    n = len(points) - 1
-    tangents, frames, torques = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
-    lengths, halves, bends = np.empty(n), np.empty(n), np.empty((n, 2))  # bends: in two directions
-    _tangents(points, tangents, lengths)
-    _perpendicular(tangents[0], frames[0])
-    total_x, total_y, total_moment = 0.0, 0.0, 0.0
-    for i in range(n - 1):
-        a, b, frame = tangents[i], tangents[i + 1], frames[i]
-        cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-        halves[i] = math.sqrt(max((1.0 + cosine) / 2, HAIRPIN))
-        x = b[0] * frame[0] + b[1] * frame[1] + b[2] * frame[2]
-        y = (b[0] * (a[1] * frame[2] - a[2] * frame[1]) + b[1] * (a[2] * frame[0] - a[0] * frame[2])
-             + b[2] * (a[0] * frame[1] - a[1] * frame[0]))
-        frames[i + 1] = frame
-        _transport(frames[i + 1], a, b)
-        bends[i, 0], bends[i, 1] = x / halves[i], y / halves[i]
-        total_x += moments[i] * bends[i, 0]
-        total_y += moments[i] * bends[i, 1]
-        total_moment += moments[i]
-    size = math.sqrt(total_x**2 + total_y**2 + (ROUNDED * total_moment / (n - 1))**2)
-    total_x /= size
-    total_y /= size
+    one, two = _mean_direction(natural, joints)
+    total = 0.0
+    for i in range(len(natural)):
+        total += natural[i, 2]
+    size = math.sqrt(one**2 + two**2 + (ROUNDED * total / len(natural))**2)
+    cosine, sine = one / size, two / size
+    twist, slope = 0.0, 0.0
+    for i in range(len(natural)):
+        twist += slope  # no torque is left about the axis of a segment
+        x, y = natural[i, 0] * cosine - natural[i, 1] * sine, natural[i, 0] * sine + natural[i, 1] * cosine
+        slope = (joints[i, 0] * y - joints[i, 1] * x) / 2
+        twist += slope
+        joints[i, 3], joints[i, 4], joints[i, 5] = cosine, sine, twist
+
+
+@_part
+def _face(angles: Vector, joints: Matrix) -> None:
+    """Write cosine and sine of the mean angle at each joint."""
+    for i in range(len(joints)):
+        phi = (angles[i] + angles[i + 1]) / 2
+        joints[i, 3], joints[i, 4] = math.cos(phi), math.sin(phi)
+
+
+@_part
+def _first_angles(frame: FrameState) -> None:
+    """Set the angles at the start: between clamps of known direction evenly twisted, else without twist."""
+    angles, clamped, clamps, segments = frame.angles, frame.clamped, frame.clamps, frame.segments
+    one, two = _mean_direction(frame.natural, frame.joints)
+    angles[:] = math.atan2(two, one)
+    last = -1
+    for s in range(len(clamped)):
+        if not math.isfinite(clamps[s, 0]):
+            continue
+        j = clamped[s, 0]
+        there = _angle_of(segments, j, clamps[s], angles[j] if last < 0 else angles[last])
+        if last < 0:
+            angles[:] = there
+        else:
+            for i in range(last, len(angles)):
+                angles[i] = angles[last] + (there - angles[last]) * min(1.0, (i - last) / (j - last))
+        last = j
+
+
+@_part
+def _in_clamps(frame: FrameState) -> None:
+    """Find out how far the segments in clamps must turn; a clamp that has just closed keeps what it finds."""
+    segments, angles, clamped, clamps = frame.segments, frame.angles, frame.clamped, frame.clamps
+    for s in range(len(clamped)):
+        j, clamp = clamped[s, 0], clamps[s]
+        if math.isfinite(clamp[0]):
+            if math.isfinite(clamp[3]):
+                _transport(clamp[:3], clamp[3:6], segments[j, :3])
+            clamp[6] = _angle_of(segments, j, clamp, angles[j]) - angles[j]
+        else:
+            cosine, sine = math.cos(angles[j]), math.sin(angles[j])
+            for c in range(3):
+                d, e = (c + 1) % 3, (c + 2) % 3
+                clamp[c] = cosine * segments[j, 4 + c] + sine * (
+                    segments[j, d] * segments[j, 4 + e] - segments[j, e] * segments[j, 4 + d])
+            clamp[6] = 0.0
+        for c in range(3):
+            clamp[3 + c] = segments[j, c]
+
+
+@_part
+def _turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> None:
+    """
+    Turn the clamps with their hands.
+
+    :param turns: (h, 9) rotation matrices of the held nodes' hands in this step; (0, 0): the hands turn
+        by the smallest rotation that follows the segment.
+    """
+    if len(turns) == 0:
+        return
+    for s in range(len(clamped)):
+        h = clamped[s, 1]
+        for k in range(0, 6, 3):  # the direction and the tangent
+            x, y, z = clamps[s, k], clamps[s, k + 1], clamps[s, k + 2]
+            for c in range(3):
+                clamps[s, k + c] = turns[h, 3 * c] * x + turns[h, 3 * c + 1] * y + turns[h, 3 * c + 2] * z
+
+
+@_part
+def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped: IndexRows, clamps: Matrix,
+                     joints: Matrix, turning: Matrix) -> None:
+    """
+    Turn the segments towards the balance of torques about their axes, which have almost no inertia.
+
+    The energy is that of twist plus ``-|A| cos(delta)`` of natural curvature at each joint, with delta the
+    mean angle of both segments from the plane of the bend.  Where delta changes by less than `REACH`, the
+    parabola with the curvature ``|A| (cos(delta) + REACH / 3)`` lies nowhere below, so that a Newton step of
+    at most that size lowers the energy; where the matrix is not positive definite, its pivots are replaced
+    (Nocedal and Wright, Numerical Optimization, 2006, 3.4).
+    """
+    n = len(angles)
+    diagonal, right, coupling, upper = 0.0, 0.0, 0.0, 0.0
+    share, next_diagonal, next_right, s = 0.0, 0.0, 0.0, 0
     for i in range(n):
-        a, frame = tangents[i], frames[i]
-        x = total_x * frame[0] + total_y * (a[1] * frame[2] - a[2] * frame[1])
-        y = total_x * frame[1] + total_y * (a[2] * frame[0] - a[0] * frame[2])
-        z = total_x * frame[2] + total_y * (a[0] * frame[1] - a[1] * frame[0])
-        frame[0], frame[1], frame[2] = x, y, z
-    against_twist = np.empty(n)
-    sum_ = 0.0
-    for i in range(n - 1):
-        a, b = tangents[i], tangents[i + 1]
-        both = (total_x * bends[i, 0] + total_y * bends[i, 1]) / (4 * halves[i]**2)
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            joint = moments[i] * (
-                (b[d] * frames[i, e] - b[e] * frames[i, d]
-                 + a[d] * frames[i + 1, e] - a[e] * frames[i + 1, d]) / (2 * halves[i])
-                + both * (a[d] * b[e] - a[e] * b[d]))
-            torques[i + 1, c] += joint
-            torques[i, c] -= joint
-        sum_ -= a[0] * torques[i, 0] + a[1] * torques[i, 1] + a[2] * torques[i, 2]
-        against_twist[i] = sum_
-    for i in range(n - 1):
-        share = against_twist[i] / (2 * halves[i]**2)
-        for c in range(3):
-            axis = share * (tangents[i, c] + tangents[i + 1, c])
-            torques[i + 1, c] -= axis
-            torques[i, c] += axis
-    _add_couples(torques, tangents, lengths, step, right)
+        diagonal, right = next_diagonal - share * upper, next_right - share * right
+        coupling = 0.0
+        if i < n - 1:
+            x, y, stiffness = joints[i, 0], joints[i, 1], twisting[i]
+            one = natural[i, 0] * joints[i, 3] - natural[i, 1] * joints[i, 4]
+            two = natural[i, 0] * joints[i, 4] + natural[i, 1] * joints[i, 3]
+            slope = (x * two - y * one) / 2
+            curved = (one * x + two * y + natural[i, 2] * (REACH / 3 * (abs(x) + abs(y)) + STEADY)) / 4
+            torque = stiffness * (angles[i + 1] - angles[i])
+            coupling = curved - stiffness
+            next_diagonal, next_right = stiffness + curved, -torque - slope
+            diagonal += next_diagonal
+            right += torque - slope
+        if diagonal < 1e-6 * twisting[i - 1]:
+            diagonal = twisting[i - 1]
+        upper = coupling
+        if s < len(clamped) and clamped[s, 0] == i:
+            if math.isfinite(clamps[s, 6]):
+                diagonal, right, upper = 1.0, clamps[s, 6], 0.0
+            s += 1
+        inverse = 1.0 / diagonal
+        share = coupling * inverse
+        turning[i, 0], turning[i, 1] = right * inverse, upper * inverse
+    largest = 2 * REACH
+    for i in range(n - 2, -1, -1):
+        turning[i, 0] -= turning[i, 1] * turning[i + 1, 0]
+        largest = max(largest, abs(turning[i, 0] + turning[i + 1, 0]))
+    share = 2 * REACH / largest
+    for i in range(n):
+        angles[i] += share * turning[i, 0]
+    for s in range(len(clamped)):
+        if math.isfinite(clamps[s, 6]):
+            angles[clamped[s, 0]] += (1.0 - share) * clamps[s, 6]
 
 
 @_part
-def add_twist(points: Matrix, spans: Spans, step: float, right: Vector) -> None:
+def add_frame(frame: FrameState, turns: Matrix, step: float, right: Vector) -> None:
     """
-    Add to `right` (3 N,) the impulses [N s] of twist between clamps; update `spans`.
+    Add to `right` (3 N,) the impulses [N s] of natural curvature and twist; see `rod`.
 
-    A DLO has almost no inertia about its axis, so its twisting moment is constant between two
-    clamps.  The energy is ``c / 2 angle^2`` (Bergou et al., Discrete Elastic Rods, 2008, 4.2.2).
-    To measure the angle, a frame is transported along the DLO without twist from the first clamp
-    to the second and compared with the frame of the second clamp.  The angle is zero when both
-    have just closed.  The trial gives only the direction of a clamp, not its rotation about the
-    DLO's axis: we take the smallest rotation since it closed.
+    The forces are the exact gradient of the energy, for segments that move without turning about their axes.
+    A segment has no inertia about its axis, so that a couple of forces at its ends replaces the torque on it.
 
-    The forces are the exact gradient: the same torque about every joint, whose part across
-    a segment becomes a couple of forces at its ends.
+    :param turns: see `_turn_clamps`.
     """
-    n = len(points) - 1
-    tangents, torques, lengths = np.empty((n, 3)), np.zeros((n, 3)), np.empty(n)
-    _tangents(points, tangents, lengths)
-    frame, there, before = np.empty(3), np.empty(3), np.empty(3)
-    for k in range(len(spans)):
-        span = spans[k]
-        a, b = span.first, span.last
-        if span.begun == 0:
-            _perpendicular(tangents[a], frame)
-            for c in range(3):
-                span.start[c], span.start_frame[c] = tangents[a, c], frame[c]
-        for c in range(3):
-            before[c], frame[c] = span.start[c], span.start_frame[c]
-        _transport(frame, before, tangents[a])
-        for i in range(a, b):
-            _transport(frame, tangents[i], tangents[i + 1])
-        if span.begun == 0:
-            span.begun = 1
-            for c in range(3):
-                span.end[c], span.end_frame[c] = tangents[b, c], frame[c]
-        for c in range(3):
-            before[c], there[c] = span.end[c], span.end_frame[c]
-        _transport(there, before, tangents[b])
-        x, y = 0.0, 0.0
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            x += frame[c] * there[c]
-            y += tangents[b, c] * (frame[d] * there[e] - frame[e] * there[d])
-        angle = math.atan2(y, x)
-        angle += 2 * math.pi * round((span.angle - angle) / (2 * math.pi))
-        span.angle = angle
-        for i in range(a, b):
-            square = 0.0
-            for c in range(3):
-                square += (tangents[i, c] + tangents[i + 1, c])**2
-            share = span.stiffness * angle / max(square / 2, 2 * HAIRPIN)
-            for c in range(3):
-                joint = share * (tangents[i, c] + tangents[i + 1, c])
-                torques[i + 1, c] -= joint
-                torques[i, c] += joint
-    _add_couples(torques, tangents, lengths, step, right)
+    natural, twisting, angles, begun = frame.natural, frame.twisting, frame.angles, frame.begun
+    segments, joints, clamped, clamps = frame.segments, frame.joints, frame.clamped, frame.clamps
+    _carry_along(segments, joints, frame.carried, begun[0] == 1)
+    if len(twisting) == 0:
+        _turn_freely(natural, joints)
+    else:
+        if begun[0] == 0:
+            _first_angles(frame)
+            for s in range(len(clamped)):
+                if math.isfinite(clamps[s, 0]):
+                    clamps[s, 6] = 0.0
+            for _ in range(FIRST_TURNS):
+                _face(angles, joints)
+                _balance_torques(natural, twisting, angles, clamped, clamps, joints, frame.turning)
+            _face(angles, joints)
+        _in_clamps(frame)
+        _balance_torques(natural, twisting, angles, clamped, clamps, joints, frame.turning)
+        _face(angles, joints)
+        for i in range(len(joints)):
+            joints[i, 5] = twisting[i] * (angles[i + 1] - angles[i])
+        _turn_clamps(clamped, clamps, turns)
+    begun[0] = 1
+    p0, p1, p2 = 0.0, 0.0, 0.0  # torque [N m] of the joint before
+    for i in range(len(joints) + 1):
+        a0, a1, a2, inverse = segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3]
+        q0, q1, q2 = 0.0, 0.0, 0.0  # of the joint behind
+        if i < len(joints):
+            m0, m1, m2 = a0 + segments[i + 1, 0], a1 + segments[i + 1, 1], a2 + segments[i + 1, 2]
+            u0, u1, u2 = segments[i, 4], segments[i, 5], segments[i, 6]
+            one = natural[i, 0] * joints[i, 3] - natural[i, 1] * joints[i, 4]
+            two = natural[i, 0] * joints[i, 4] + natural[i, 1] * joints[i, 3]
+            d0 = one * u0 + two * (a1 * u2 - a2 * u1)
+            d1 = one * u1 + two * (a2 * u0 - a0 * u2)
+            d2 = one * u2 + two * (a0 * u1 - a1 * u0)
+            half = joints[i, 2] / 2
+            twist = 2 * half * joints[i, 5]
+            q0 = half * (m1 * d2 - m2 * d1 - twist * m0)
+            q1 = half * (m2 * d0 - m0 * d2 - twist * m1)
+            q2 = half * (m0 * d1 - m1 * d0 - twist * m2)
+        t0, t1, t2 = p0 - q0, p1 - q1, p2 - q2
+        p0, p1, p2 = q0, q1, q2
+        share = step * inverse
+        f0, f1, f2 = share * (t1 * a2 - t2 * a1), share * (t2 * a0 - t0 * a2), share * (t0 * a1 - t1 * a0)
+        j = 3 * i
+        right[j] -= f0
+        right[j + 1] -= f1
+        right[j + 2] -= f2
+        right[j + 3] += f0
+        right[j + 4] += f1
+        right[j + 5] += f2
 
 
 @_part
-def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> bool:
+def add_friction(friction: SlipState, points: Matrix, velocities: Matrix, implicit: float, step: float,
+                 bands: Matrix, right: Vector) -> None:
+    """
+    Add to `right` the impulses [N s] of friction between strands, and its stiffness to `bands`; see `rod`.
+
+    The element is elastic and perfectly plastic (Iwan, A Distributed-Element Model for Hysteresis, 1966):
+    where the bend is further than `slip` from the one that is kept, the latter follows.  What is kept turns
+    with the DLO by the smallest rotation of the mean tangent.  Where the strands are going to slip in this
+    step, the stiffness is that of the secant: a larger one would brake too much, a smaller one rattle.
+
+    :param implicit: c [s^2] of the step; see `rod`.
+    """
+    rows, kept = friction.rows, friction.kept
+    begun, ahead = friction.begun[0] == 1, implicit / step
+    friction.begun[0] = 1
+    for i in range(len(rows)):
+        r0, r1, r2, stiffness, slip = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
+        x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
+        x2, y2, z2 = points[i + 2, 0], points[i + 2, 1], points[i + 2, 2]
+        bx = r0 * x0 + r1 * points[i + 1, 0] + r2 * x2
+        by = r0 * y0 + r1 * points[i + 1, 1] + r2 * y2
+        bz = r0 * z0 + r1 * points[i + 1, 2] + r2 * z2
+        tx, ty, tz = x2 - x0, y2 - y0, z2 - z0
+        size = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
+        tx, ty, tz = size * tx, size * ty, size * tz
+        px, py, pz = bx, by, bz
+        if begun:
+            px, py, pz = kept[i, 0], kept[i, 1], kept[i, 2]
+            sx, sy, sz = kept[i, 3], kept[i, 4], kept[i, 5]
+            along = 2 * (sx * px + sy * py + sz * pz)
+            sx, sy, sz = sx + tx, sy + ty, sz + tz
+            share = 2 * (sx * px + sy * py + sz * pz) / max(sx * sx + sy * sy + sz * sz, 4 * HAIRPIN)
+            px += along * tx - share * sx
+            py += along * ty - share * sy
+            pz += along * tz - share * sz
+        ex, ey, ez = bx - px, by - py, bz - pz
+        square = ex * ex + ey * ey + ez * ez
+        if square > slip * slip:  # the strands have slipped
+            share = slip / math.sqrt(square)
+            ex, ey, ez = share * ex, share * ey, share * ez
+            px, py, pz = bx - ex, by - ey, bz - ez
+        kept[i, 0], kept[i, 1], kept[i, 2] = px, py, pz
+        kept[i, 3], kept[i, 4], kept[i, 5] = tx, ty, tz
+        bx = ex + ahead * (r0 * velocities[i, 0] + r1 * velocities[i + 1, 0] + r2 * velocities[i + 2, 0])
+        by = ey + ahead * (r0 * velocities[i, 1] + r1 * velocities[i + 1, 1] + r2 * velocities[i + 2, 1])
+        bz = ez + ahead * (r0 * velocities[i, 2] + r1 * velocities[i + 1, 2] + r2 * velocities[i + 2, 2])
+        square = bx * bx + by * by + bz * bz
+        if square > slip * slip:
+            stiffness *= slip / math.sqrt(square)
+        weight, moment = implicit * stiffness, step * stiffness
+        j = 3 * i
+        ex, ey, ez = moment * ex, moment * ey, moment * ez
+        right[j] -= r0 * ex
+        right[j + 1] -= r0 * ey
+        right[j + 2] -= r0 * ez
+        right[j + 3] -= r1 * ex
+        right[j + 4] -= r1 * ey
+        right[j + 5] -= r1 * ez
+        right[j + 6] -= r2 * ex
+        right[j + 7] -= r2 * ey
+        right[j + 8] -= r2 * ez
+        w00, w01, w02 = weight * r0 * r0, weight * r0 * r1, weight * r0 * r2
+        w11, w12, w22 = weight * r1 * r1, weight * r1 * r2, weight * r2 * r2
+        for k in range(j, j + 3):
+            bands[k, 0] += w00
+            bands[k, 3] += w01
+            bands[k, 6] += w02
+            bands[k + 3, 0] += w11
+            bands[k + 3, 3] += w12
+            bands[k + 6, 0] += w22
+
+
+@_part
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Matrix,
+                   predicted: Matrix) -> bool:
     """
     Write to `predicted` the (N, 3) velocities [m/s] after a step of the internal forces; see `rod`.
 
+    :param turns: see `_turn_clamps`.
     :returns: False if the rollout diverges.
     """
     rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
@@ -432,6 +655,7 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
     drag, implicit, step = rod.drag, rod.implicit, rod.step
     n = len(points)
     size = 3 * n
+    framed, segments = len(rod.frame.angles) > 0, rod.frame.segments
     for j in range(size):
         for k in range(BAND):
             bands[j, k] = 0.0
@@ -459,7 +683,12 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
         y = points[i + 1, 1] - points[i, 1]
         z = points[i + 1, 2] - points[i, 2]
         square = x * x + y * y + z * z
-        slack = 1.0 - rest[i] / math.sqrt(square)
+        length = math.sqrt(square)
+        slack = 1.0 - rest[i] / length
+        if framed:
+            inverse = 1.0 / length
+            segments[i, 0], segments[i, 1], segments[i, 2] = x * inverse, y * inverse, z * inverse
+            segments[i, 3] = inverse
         tension = stiffness[i] * slack * step
         across = max(slack, 0.0) * stiffness[i]
         along = implicit * (stiffness[i] - across) / square
@@ -489,10 +718,10 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
         bands[j + 2, 1] -= xz
         bands[j + 2, 2] -= yz
         bands[j + 2, 3] -= zz
-    if len(rod.natural) > 0:
-        add_natural(points, rod.natural, step, right)
-    if len(rod.spans) > 0:
-        add_twist(points, rod.spans, step, right)
+    if framed:
+        add_frame(rod.frame, turns, step, right)
+    if len(rod.friction.rows) > 0:
+        add_friction(rod.friction, points, velocities, 0.6 * step * step, step, bands, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
         for c in range(3):
@@ -782,17 +1011,18 @@ def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Ma
 
 
 @_compiled
-def predict_velocities(rope: RopeState, targets: Matrix) -> bool:
+def predict_velocities(rope: RopeState, targets: Matrix, turns: Matrix) -> bool:
     """
     Write to `rope.predicted` the velocities due to gravity, internal forces and self-contact.
 
     :param targets: (h, 3) [m] positions of the held nodes after the step.
+    :param turns: see `_turn_clamps`.
     :returns: False if the rollout diverges.
     """
     rod, contact = rope.rod, rope.contact
     points, velocities, predicted = rope.points, rope.velocities, rope.predicted
     _start_step(points, velocities, rope.gravity, targets, rod.held, rod.follow, rod.step)
-    if not rod_velocities(rod, points, velocities, predicted):
+    if not rod_velocities(rod, points, velocities, turns, predicted):
         return False
     if may_touch(predicted, rod.step, contact.room, contact.near):
         keep_apart(contact, points, predicted, rod.inverse_masses, rope.support, rod.step)
@@ -800,11 +1030,12 @@ def predict_velocities(rope: RopeState, targets: Matrix) -> bool:
 
 
 @_compiled
-def advance(rope: RopeState, targets: Cube, level: float, path: Cube) -> int:
+def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cube) -> int:
     """
     Take k steps on a table.
 
     :param targets: (k, h, 3) [m] positions of the held nodes after each step.
+    :param turns: (k, h, 9) of `_turn_clamps` in each step, or (0, 0, 0).
     :param level: height of nodes that touch the table [m].
     :param path: (k, N, 3) [m] where the positions of all nodes after each step are written; or empty.
     :returns: number of steps taken, below k if the rollout diverged.
@@ -813,9 +1044,10 @@ def advance(rope: RopeState, targets: Cube, level: float, path: Cube) -> int:
     points, velocities, predicted, support = rope.points, rope.velocities, rope.predicted, rope.support
     held, follow, step, friction = rod.held, rod.follow, rod.step, contact.friction
     room, near = contact.room, contact.near
+    free = np.empty((0, 0))
     for k in range(len(targets)):
         _start_step(points, velocities, gravity, targets[k], held, follow, step)
-        if not rod_velocities(rod, points, velocities, predicted):
+        if not rod_velocities(rod, points, velocities, turns[k] if len(turns) > 0 else free, predicted):
             return k
         if may_touch(predicted, step, room, near):
             keep_apart(contact, points, predicted, inverse_masses, support, step)

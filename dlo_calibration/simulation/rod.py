@@ -19,9 +19,23 @@ but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes would ring f
 at this limit the damping depends on the time step.  The negative part of the matrix of
 a compressed spring is left out, so that the matrix stays positive definite.
 
-`kernels` take the step and add natural curvature and twist; this module computes their
-input.  If parts of the DLO differ in stiffness, an inner node has the stiffness of the
-pieces on its two sides in series.
+The rest shape may be curved, and the DLO may resist twist.  Then each segment has a material
+frame, turned by an angle from a frame that is carried along without twist (Bergou et al.,
+2008; Bishop, There is more than one way to frame a curve, 1975).  With natural curvature k,
+two components in the material frame, the bending energy becomes
+``EI / (2 l) |t_i - t_(i-1) - l k_i|^2``: beside the energy of a straight DLO and a constant,
+there is the mixed term ``-EI k_i . (t_i - t_(i-1))``, where k_i has the mean angle of both
+segments.  The twisting energy is ``GJ / (2 l) (angle_i - angle_(i-1))^2``.  A DLO has almost no
+inertia about its axis, so that the angles are those of least energy: a clamp prescribes them,
+free ends and pins are without torque.  Where clamps are not to hold the DLO (torsion 0), it turns
+freely as a whole, and does not twist.
+
+Strands that rub on each other resist bending as an elastic, perfectly plastic element beside the elastic
+one.  Its state is the bend p_i at which it is free of stress, at first that of the start:
+``e = t_i - t_(i-1) - p_i`` causes the moment ``k EI e / l``, and where |e| exceeds ``l slip``, p_i follows.
+
+`kernels` take the step; this module computes their input.  If parts of the DLO differ in
+stiffness, an inner node has the stiffness of the pieces on its two sides in series.
 """
 
 from __future__ import annotations
@@ -33,8 +47,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import PART_NAMES
-from dlo_calibration.simulation.kernels import BAND, RodState, SPAN, Spans
+from dlo_calibration.model.parameters import knot_names, KNOTS, PART_NAMES
+from dlo_calibration.simulation.kernels import BAND, FrameState, RodState, SlipState
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,11 @@ class RodProperties:
     :param marker_mass: mass at each point annotated as feature [kg].
     :param torsion: twisting stiffness relative to the bending stiffness.
     :param profile: bending stiffness of parts of equal length, relative to that of the first part.
+    :param bending_friction: largest moment of friction between the strands, relative to EI [1/m].
+    :param bending_slip: change of curvature at which they slip [1/m].
+    :param rest_curvature: K pairs of components of the natural curvature [1/m], at places that divide the
+        length evenly; linear between them.
+    :param clamp_twist: angle [rad] between the rest shape and clamps in the second half, see `Rope`.
     """
 
     bending_stiffness: float
@@ -64,6 +83,10 @@ class RodProperties:
     marker_mass: float = 0.0
     torsion: float = 0.0
     profile: tuple[float, ...] = (1.0,)
+    bending_friction: float = 0.0
+    bending_slip: float = 0.1
+    rest_curvature: tuple[tuple[float, float], ...] = ()
+    clamp_twist: float = 0.0
 
     @classmethod
     def of(cls, physical: Mapping[str, float]) -> RodProperties:
@@ -73,13 +96,18 @@ class RodProperties:
         Optional ones may be absent, as in results of older versions.
         """
         profile = (1.0, *(physical[name] for name in PART_NAMES if name in physical))
+        known = [physical[name] for name in knot_names(KNOTS[-1]) if name in physical]
         return cls(bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
                    mass=physical['mass'], drag=physical['damping'],
                    internal_damping=physical['internal_damping'],
                    length_scale=physical.get('length_scale', 1.0),
                    natural_curvature=physical.get('natural_curvature', 0.0),
                    marker_mass=physical.get('marker_mass', 0.0),
-                   torsion=physical.get('torsion', 0.0), profile=profile)
+                   torsion=physical.get('torsion', 0.0), profile=profile,
+                   bending_friction=physical.get('bending_friction', 0.0),
+                   bending_slip=physical.get('bending_slip', 0.1),
+                   rest_curvature=tuple(zip(known[::2], known[1::2], strict=True)),
+                   clamp_twist=physical.get('clamp_twist', 0.0))
 
 
 class Rod:
@@ -105,38 +133,82 @@ class Rod:
         self._properties = properties
         self.state = RodState(
             rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
-            masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), natural=np.zeros(0),
-            spans=np.zeros(0, SPAN), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
+            masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), frame=_no_frame(),
+            friction=_no_friction(), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
             drag=float(properties.drag),
             implicit=float(time_step * max(properties.internal_damping, 0.6 * time_step)),
             step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
             right=np.empty(3 * n + BAND - 1))
         self.hold(())
 
-    def hold(self, nodes: Sequence[int]) -> None:
+    def hold(self, nodes: Sequence[int], directions: Mapping[int, Floats] | None = None) -> None:
         """
         Let exactly these nodes follow given velocities from now on.
 
         A segment between two held nodes is rigid, so bending begins at its end, where a
         clamped DLO leaves its clamp.
+
+        :param directions: unit vectors (3,) across clamped segments, by segment, that belong to the
+            material frame.  Other clamps hold the DLO as they find it.
         """
-        state, properties = self.state, self._properties
+        state = self.state
         held = np.array(nodes, np.int64)
         follows = np.isin(np.arange(len(state.masses)), held)
         rigid = follows[:-1] & follows[1:]
         stiffnesses = self._stiffnesses(rigid)
-        natural: Floats = np.zeros(0)
-        if properties.natural_curvature and not rigid.all():
-            natural = properties.natural_curvature * np.where(rigid[:-1] & rigid[1:], 0.0, stiffnesses)
-        spans = state.spans
-        if properties.torsion > 0:
-            bendable = np.where(rigid, 0.0, state.rest_lengths)
-            compliances = (bendable[:-1] + bendable[1:]) / (2 * properties.torsion * stiffnesses)
-            spans = _spans_between(rigid, compliances, spans)
+        bendable = np.where(rigid, 0.0, state.rest_lengths)
+        cells = (bendable[:-1] + bendable[1:]) / 2  # [m] length that bends at each inner node
+        joints = np.divide(stiffnesses, cells, out=np.zeros_like(cells), where=cells > 0)
         self.state = state._replace(
-            held=held, follow=np.zeros((len(held), 3)), natural=natural, spans=spans,
+            held=held, follow=np.zeros((len(held), 3)),
+            frame=self._frame(rigid, stiffnesses, cells, held, directions or {}),
+            friction=self._friction(joints, cells),
             inverse_masses=np.where(follows, 0.0, 1 / state.masses),
-            bending=_bending_bands(state.rest_lengths, rigid, stiffnesses))
+            bending=_bending_bands(_curvature_rows(state.rest_lengths), joints))
+
+    def _frame(self, rigid: NDArray[np.bool_], stiffnesses: Floats, cells: Floats, held: NDArray[np.int64],
+               directions: Mapping[int, Floats]) -> FrameState:
+        """Return the material frame; what the previous one knows of angles and clamps is kept."""
+        properties, before = self._properties, self.state.frame
+        twists = properties.torsion > 0
+        clamped = np.flatnonzero(rigid) if twists else np.zeros(0, np.int64)
+        curved = bool(properties.natural_curvature) or bool(np.any(properties.rest_curvature))
+        if not (curved or len(clamped)) or rigid.all():
+            return _no_frame()
+        n = len(rigid)
+        inner = np.cumsum(self.state.rest_lengths)[:-1] / self.state.rest_lengths.sum()
+        curvature = np.zeros((n - 1, 2))
+        curvature[:, 0] = properties.natural_curvature
+        if properties.rest_curvature:
+            knots = np.linspace(0, 1, len(properties.rest_curvature))
+            for component, values in enumerate(np.array(properties.rest_curvature).T):
+                curvature[:, component] += np.interp(inner, knots, values)
+        natural = np.where(cells > 0, stiffnesses, 0.0)[:, None] * curvature
+        cells = np.where(cells > 0, cells, self.state.rest_lengths[1:])  # inside a clamp, any stiffness does
+        frame = before if len(before.angles) else _frame_of(n)
+        known = {int(segment): clamp for (segment, _), clamp in zip(frame.clamped, frame.clamps, strict=True)}
+        clamps = np.full((len(clamped), 7), np.nan)
+        for clamp, segment in zip(clamps, clamped.tolist(), strict=True):
+            if segment in known:
+                clamp[:] = known[segment]
+            elif segment in directions:
+                clamp[:3] = directions[segment]
+        places = {int(node): place for place, node in enumerate(held)}
+        return frame._replace(
+            natural=np.column_stack([natural, np.hypot(*natural.T)]),
+            twisting=properties.torsion * stiffnesses / cells if twists else np.zeros(0), clamps=clamps,
+            clamped=np.array([(segment, places[segment]) for segment in clamped.tolist()],
+                             np.int64).reshape(-1, 2))
+
+    def _friction(self, joints: Floats, cells: Floats) -> SlipState:
+        """Return the friction between strands; what the previous one keeps of the bends is kept."""
+        properties, before = self._properties, self.state.friction
+        if not properties.bending_friction > 0:
+            return before
+        slip = properties.bending_slip
+        rows = np.column_stack([_curvature_rows(self.state.rest_lengths),
+                                joints * (properties.bending_friction / slip), cells * slip])
+        return before._replace(rows=rows, kept=before.kept if len(before.kept) else np.zeros((len(cells), 6)))
 
     def _stiffnesses(self, rigid: NDArray[np.bool_]) -> Floats:
         """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
@@ -162,36 +234,42 @@ class Rod:
         return stiffness
 
 
-def _spans_between(rigid: NDArray[np.bool_], compliances: Floats, before: Spans) -> Spans:
-    """
-    Return the parts of a DLO between two clamps, (s,) of `SPAN`.
-
-    :param rigid: (N - 1,) True for segments that are held.
-    :param compliances: (N - 2,) [1/(N m)] twisting compliance of each inner node.
-    :param before: the previous parts; a part between the same clamps keeps its twist.
-    """
-    held = np.flatnonzero(rigid).tolist()
-    pairs = [(a, b) for a, b in zip(held[:-1], held[1:], strict=True) if b > a + 1]
-    spans = np.zeros(len(pairs), SPAN)
-    for k, (a, b) in enumerate(pairs):
-        span = spans[k]
-        span['first'], span['last'], span['stiffness'] = a, b, 1 / compliances[a:b].sum()
-        for old in before:
-            if all(old[name] == span[name] for name in ('first', 'last', 'stiffness')):
-                spans[k] = old
-    return spans
+def _frame_of(segments: int) -> FrameState:
+    """Return the state of a material frame that has not begun, without clamps."""
+    joints = max(segments - 1, 0)
+    return FrameState(
+        natural=np.zeros((joints, 3)), twisting=np.zeros(0), angles=np.zeros(segments),
+        clamped=np.zeros((0, 2), np.int64), clamps=np.zeros((0, 7)), carried=np.zeros((3, 3)),
+        begun=np.zeros(1, np.int64), segments=np.zeros((segments, 7)), joints=np.zeros((joints, 6)),
+        turning=np.zeros((segments, 2)))
 
 
-def _bending_bands(rest_lengths: Floats, rigid: NDArray[np.bool_], stiffness: Floats) -> Floats:
-    """Return the diagonal and the two below it, (3, N) [N/m], of the symmetric (N, N) bending matrix."""
-    n = len(rest_lengths) + 1
+def _no_frame() -> FrameState:
+    """Return the frame of a straight DLO that does not resist twist."""
+    return _frame_of(0)
+
+
+def _no_friction() -> SlipState:
+    """Return the state of a DLO without friction between strands."""
+    return SlipState(rows=np.zeros((0, 5)), kept=np.zeros((0, 6)), begun=np.zeros(1, np.int64))
+
+
+def _curvature_rows(rest_lengths: Floats) -> Floats:
+    """Return (N - 2, 3) [1/m]: multiplied by three nodes, they give the change of the unit tangent there."""
     before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]
-    row = np.stack([before, -(before + after), after])  # curvature of node i from i - 1, i, i + 1
-    bendable = np.where(rigid, 0.0, rest_lengths)
-    cells = (bendable[:-1] + bendable[1:]) / 2  # [m] length that bends at each inner node
-    row *= np.sqrt(np.divide(stiffness, cells, out=np.zeros_like(cells), where=cells > 0))
+    return np.stack([before, -(before + after), after], axis=1)
+
+
+def _bending_bands(rows: Floats, joints: Floats) -> Floats:
+    """
+    Return the diagonal and the two below it, (3, N) [N/m], of the symmetric (N, N) bending matrix.
+
+    :param rows: see `_curvature_rows`.
+    :param joints: (N - 2,) [N m] moment per angle at the inner nodes.
+    """
+    n = len(rows) + 2
     bands = np.zeros((3, n))
     for a in range(3):
         for b in range(a + 1):
-            bands[a - b, b:n - 2 + b] += row[a] * row[b]
+            bands[a - b, b:n - 2 + b] += joints * rows[:, a] * rows[:, b]
     return bands

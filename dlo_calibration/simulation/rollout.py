@@ -62,12 +62,18 @@ class Stepper(Protocol):
     def hold(self, nodes: tuple[int, ...]) -> None:
         """Let exactly these nodes follow given positions from now on."""
 
-    def advance(self, targets: Floats, path: Floats | None = None) -> None:
+    @property
+    def twists(self) -> bool:
+        """Whether it makes a difference how clamps turn about the axis of the DLO."""
+
+    def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
         """
         Take k steps.
 
         :param targets: (k, h, 3) [m] positions of the held nodes after each step.
         :param path: (k, N, 3) [m] where the positions of all nodes after each step are written.
+        :param turns: (k, h, 9) rotation matrices of their hands in each step, row by row; None: a clamp
+            turns with its segment, and not about it.
         """
 
 
@@ -86,6 +92,7 @@ class _Grip:
     nodes: tuple[int, ...]
     closed: int  # number of steps when it closed
     path: Floats  # (k, n, 3) [m] positions of the nodes after each later step, until the hand rests
+    turns: Floats  # (k + 1, 9) rotations of the hand in each of these steps, and none
 
 
 class _Course:
@@ -210,12 +217,12 @@ class _Course:
                 raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
                                       f'more than {MOST_STEPS}; divide its path into several actions')
             poses = _poses if count <= MOST_KEPT_STEPS else _poses.__wrapped__
-            positions, turns = poses(hand, self._time, step, count)
+            positions, turns, each = poses(hand, self._time, step, count)
             offsets = self._stepper.points[list(nodes)] - positions[0]
             path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:], offsets)
             self._grips.pop(hand.name, None)
             self._let_go(nodes)
-            self._grips[hand.name] = _Grip(hand, nodes, self._steps, path)
+            self._grips[hand.name] = _Grip(hand, nodes, self._steps, path, each)
         if closing:
             self._hold()
 
@@ -252,12 +259,17 @@ class _Course:
         self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
 
     def _advance(self, count: int, path: Floats | None = None) -> None:
-        targets = [grip.path[np.minimum(np.arange(count) + self._steps - grip.closed, len(grip.path) - 1)]
-                   for grip in self._grips.values()]
+        grips = self._grips.values()
+        after = [np.arange(count) + self._steps - grip.closed for grip in grips]
+        targets = [grip.path[np.minimum(k, len(grip.path) - 1)] for k, grip in zip(after, grips, strict=True)]
         steps = np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3))
+        turns = None if not self._stepper.twists else np.concatenate(
+            [np.repeat(grip.turns[np.minimum(k, len(grip.turns) - 1), None], len(grip.nodes), axis=1)
+             for k, grip in zip(after, grips, strict=True)], axis=1)
         for begin in range(0, count, PIECE):
             piece = slice(begin, begin + PIECE)
-            self._stepper.advance(steps[piece], None if path is None else path[piece])
+            self._stepper.advance(steps[piece], None if path is None else path[piece],
+                                  None if turns is None else turns[piece])
             advanced()
         self._time += count * self._stepper.time_step
         self._steps += count
@@ -291,11 +303,15 @@ def _largest_move(seen: Sequence[Floats]) -> float:
 
 
 @lru_cache(maxsize=64)
-def _poses(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats]:
+def _poses(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats, Floats]:
     """
-    Return the positions (count + 1, 3) [m] of a hand after 0 to `count` steps, and its rotations since.
+    Return positions and rotations of a hand.
+
+    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 3, 3) rotations until then;
+        (count + 1, 9) rotations in each step, row by row, and at last none.
 
     They are cached because they are the same for every parameter set.
     """
     positions, turns = hand.poses(start + step * np.arange(count + 1))
-    return frozen_array(positions), frozen_array(turns @ turns[0].T)
+    each = np.concatenate([turns[1:] @ turns[:-1].transpose(0, 2, 1), np.eye(3)[None]]).reshape(-1, 9)
+    return frozen_array(positions), frozen_array(turns @ turns[0].T), frozen_array(each)

@@ -26,11 +26,17 @@ class Rope:
     :param time_step: [s].
     :param gravity: (3,) [m/s^2].
     :param features: (N,) number of points annotated as feature at each node; None: there are none.
+    :param directions: (N - 1, 3) of the clamps that hold from the start, see `NodeLayout`; None: unknown.
     """
 
     def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
-                 time_step: float, gravity: Floats, features: Floats | None = None) -> None:
-        self._rod = Rod(np.diff(places), RodProperties.of(physical), time_step, features)
+                 time_step: float, gravity: Floats, features: Floats | None = None,
+                 directions: Floats | None = None) -> None:
+        properties = RodProperties.of(physical)
+        self._rod = Rod(np.diff(places), properties, time_step, features)
+        # A rest shape of unknown direction turns to where the DLO is bent at the start.
+        self._directions = {} if directions is None or not properties.rest_curvature else _in_clamps(
+            directions, np.diff(points, axis=0), places, properties.clamp_twist)
         points = np.array(points, dtype=float)
         contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
         kernels.start_distances(contact, points)
@@ -45,10 +51,34 @@ class Rope:
         """The nodes' positions now, (N, 3) [m]; a copy."""
         return self.state.points.copy()
 
+    @property
+    def twists(self) -> bool:
+        """Whether it makes a difference how clamps turn about the axis of the DLO."""
+        return len(self.state.rod.frame.clamped) > 0
+
     def hold(self, nodes: Sequence[int]) -> None:
         """Let exactly these nodes follow given positions from now on."""
-        self._rod.hold(nodes)
+        self._rod.hold(nodes, {} if self.state.rod.frame.begun[0] else self._directions)
         self.state = self.state._replace(rod=self._rod.state)
+
+
+def _in_clamps(directions: Floats, segments: Floats, places: Floats, twist: float) -> dict[int, Floats]:
+    """
+    Return the direction of the rest shape, (3,), in each clamped segment.
+
+    :param directions: (N - 1, 3) unit vectors across the segments; nan where there is no clamp.
+    :param segments: (N - 1, 3) [m] vectors from node to node.
+    :param places: (N,) [m] arc lengths of the nodes.
+    :param twist: angle [rad] by which those in the second half of the DLO are turned about its axis.
+    """
+    found = {}
+    for segment in np.flatnonzero(np.isfinite(directions[:, 0])).tolist():
+        across = directions[segment]
+        if places[segment] + places[segment + 1] > places[-1]:
+            axis = segments[segment] / np.linalg.norm(segments[segment])
+            across = np.cos(twist) * across + np.sin(twist) * np.cross(axis, across)
+        found[segment] = across
+    return found
 
 
 def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernels.SelfContact:

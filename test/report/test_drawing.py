@@ -141,6 +141,7 @@ def test_instants_between_change_nothing_of_the_course(held_by):
         """Write down which nodes are held, and where."""
 
         time_step = 0.01
+        twists = False
 
         def __init__(self, points):
             self._points, self.nodes, self.course = np.array(points), (), []
@@ -152,7 +153,7 @@ def test_instants_between_change_nothing_of_the_course(held_by):
         def hold(self, nodes):
             self.nodes = nodes
 
-        def advance(self, targets, path=None):
+        def advance(self, targets, path=None, turns=None):
             for k, target in enumerate(targets):
                 self._points[list(self.nodes)] = target
                 self.course.append((self.nodes, self._points.copy()))

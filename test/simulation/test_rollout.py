@@ -24,6 +24,7 @@ class Sinking:
 
     def __init__(self, points, until):
         self.time_step = STEP
+        self.twists = False
         self._points = np.array(points)
         self._left = round(until / STEP) if np.isfinite(until) else np.inf
         self._held = []
@@ -36,7 +37,7 @@ class Sinking:
         assert len(set(nodes)) == len(nodes)
         self._held = list(nodes)
 
-    def advance(self, targets, path=None):
+    def advance(self, targets, path=None, turns=None):
         assert targets.shape[1:] == (len(self._held), 3)
         for k, target in enumerate(targets):
             if self._left > 0:

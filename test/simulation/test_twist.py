@@ -3,132 +3,105 @@
 
 """Twist between two clamps: its energy and forces, and what turning a clamp does to a DLO."""
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
-from oracles import twist_forces
 import pytest
 from stepping import SteppedRod as Rod
-from test_rod import CABLE, crumpled, NONE, straight
+from test_rod import crumpled, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.kernels import SPAN
 from dlo_calibration.simulation.rod import RodProperties
 
-
-def clamped(count, stiffness=2.0):
-    """Return the span between the first and the last segment of `count`."""
-    spans = np.zeros(1, SPAN)
-    spans['last'], spans['stiffness'] = count - 1, stiffness
-    return spans
+ENDS = (0, 1, 11, 12)
+CLAMPED = RodProperties(1e-2, 500.0, 0.05, torsion=0.7)
 
 
-def forces(points, spans):
-    compiled = np.zeros(points.size)
-    kernels.add_twist(points, spans, 1.0, compiled)
-    return compiled.reshape(-1, 3)
+def held(points, nodes=ENDS, properties=CLAMPED):
+    """Return a rod whose clamps have just closed, as they find it."""
+    rod = Rod(np.full(len(points) - 1, 0.05), properties, 1e-8)
+    rod.hold(nodes)
+    rod.frame_forces(points)
+    return rod
 
 
-def begun(seed, count=9):
-    """Return points, and a span that began elsewhere: it is twisted."""
-    rest = np.random.default_rng(seed).uniform(0.02, 0.06, count)
-    spans = clamped(count)
-    forces(crumpled(seed, rest, 0.15), spans)
-    return crumpled(seed + 1, rest, 0.15), spans
+def moments(rod, points):
+    """Return the (N - 2,) [N m] twisting moments at rest."""
+    rod.frame_forces(points, 100)
+    state = rod.state.frame
+    return state.twisting * np.diff(state.angles) if len(state.angles) else np.zeros(len(points) - 2)
 
 
-@settings(derandomize=True, max_examples=10)
-@given(st.integers(0, 2**31))
-def test_forces_are_the_slope_of_the_energy(seed):
-    points, spans = begun(seed)
-
-    def energy(points):
-        moved = spans.copy()
-        forces(points, moved)
-        return moved['stiffness'][0] * moved['angle'][0]**2 / 2
-
-    got = forces(points, spans.copy())
-    # A clamp's segment may turn its frame: what acts on it is the clamp's affair.
-    for index in np.ndindex(points.shape):
-        if 2 <= index[0] < len(points) - 2:
-            moved = np.zeros_like(points)
-            moved[index] = 1e-6
-            expected = (energy(points - moved) - energy(points + moved)) / 2e-6
-            assert got[index] == pytest.approx(expected, abs=1e-5 * np.abs(got).max())
-
-
-@settings(derandomize=True, max_examples=20)
-@given(st.integers(0, 2**31))
-def test_the_compiled_forces_are_the_same(seed):
-    points, spans = begun(seed)
-    same = spans.copy()
-    for shift in (0.0, 0.002, 0.004):
-        here = points + shift * np.random.default_rng(seed).normal(size=points.shape)
-        expected = twist_forces(here, spans)
-        assert forces(here, same) == pytest.approx(expected, abs=1e-10 * max(1, np.abs(expected).max()))
-        for name in SPAN.names:
-            assert same[name] == pytest.approx(spans[name], abs=1e-9)
-
-
-def test_the_compiled_frame_begins_untwisted():
-    points = crumpled(3, np.full(9, 0.05), 0.3)
-    spans = clamped(9)
-    assert np.abs(forces(points, spans)).max() < 1e-12 / 0.004
-    assert spans['angle'][0] == pytest.approx(0, abs=1e-9)
+def test_a_dlo_is_clamped_without_twist():
+    points = crumpled(3, np.full(12, 0.05), 0.3)
+    rod = held(points)
+    assert np.abs(moments(rod, points)).max() < 1e-12
+    assert np.abs(rod.frame_forces(points)).max() < 1e-12
 
 
 def test_nothing_twists_in_a_plane():
-    angles = np.linspace(0, 5, 20)
+    angles = np.linspace(0, 5, 13)
     points = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-    spans = clamped(19)
+    rod = held(points)
     for size in (1.0, 0.8, 0.5):
-        assert np.abs(forces(points * (size, 1, 1), spans)).max() < 1e-9
+        assert np.abs(moments(rod, points * (size, 1, 1))).max() < 1e-9
 
 
-def test_parts_between_clamps_only_and_in_series():
-    rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
-    assert len(rod.state.spans) == 0
-    rod.hold((3,))
-    assert len(rod.state.spans) == 0
-    rod.hold((0, 1, 5, 11, 12))  # the one in the middle is a pin
-    (span,) = rod.state.spans
-    assert (span['first'], span['last']) == (0, 11)
-    assert span['stiffness'] == pytest.approx(0.7 * 1e-2 / 0.5)
-    assert len(Rod(np.full(12, 0.05), CABLE, 0.004).state.spans) == 0
+def test_clamps_twist_the_part_between_them_and_nothing_else():
+    points = straight(np.full(12, 0.05))
+    for nodes, lengths in (((0, 1, 11, 12), {(1, 11): 0.5}), ((0, 1, 6, 7), {(1, 6): 0.25}),
+                           ((0, 1, 5, 11, 12), {(1, 11): 0.5}), ((0, 6, 7), {}), ((3,), {}), ((0, 12), {}),
+                           ((0, 1, 7, 8, 11, 12), {(1, 7): 0.3, (8, 11): np.inf})):
+        rod = held(points, nodes)
+        rod.turned(points, {node: (0.8, 0, 0) for node in nodes if node > 5 and node + 1 in nodes})
+        expected = np.zeros(11)
+        for (first, last), length in lengths.items():
+            expected[first - 1:last] = 0.7 * 1e-2 * 0.8 / length
+        assert moments(rod, points) == pytest.approx(expected, abs=1e-9), nodes
+
+
+@pytest.mark.parametrize('turn', [1.0, 3.0, 9.0, -20.0])
+def test_a_clamp_that_turns_about_its_axis_twists_the_dlo_by_that_angle(turn):
+    angles = np.linspace(0, 2, 13)
+    points = 0.3 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    axis = (points[12] - points[11]) / np.linalg.norm(points[12] - points[11])
+    rod = held(points)
+    rod.turned(points, {11: turn * axis})
+    assert moments(rod, points) == pytest.approx(np.full(11, 0.7 * 1e-2 * turn / 0.5))
 
 
 def test_what_stays_between_the_same_clamps_stays_twisted():
-    rod = Rod(np.full(12, 0.05), RodProperties(1e-2, 500.0, 0.05, torsion=0.7), 0.004)
-    rod.hold((0, 1, 11, 12))
-    rod.state.spans['angle'][0] = 1.5
+    points = straight(np.full(12, 0.05))
+    rod = held(points)
+    rod.turned(points, {11: (1.5, 0, 0)})
+    twisted = moments(rod, points)
+    assert twisted.min() > 0.01
     rod.hold((0, 1, 6, 11, 12))
-    assert rod.state.spans['angle'][0] == 1.5
+    assert moments(rod, points) == pytest.approx(twisted)
+    rod.hold((0, 1, 5, 6, 11, 12))  # a clamp in the middle keeps what it finds
+    assert moments(rod, points)[[1, 9]] == pytest.approx(twisted[[1, 9]], rel=0.15)
     rod.hold((0, 1))
+    assert moments(rod, points) == pytest.approx(np.zeros(11), abs=1e-12)
     rod.hold((0, 1, 11, 12))
-    assert rod.state.spans['angle'][0] == 0
+    assert moments(rod, points) == pytest.approx(np.zeros(11), abs=1e-12)
 
 
-def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much():
+@pytest.mark.parametrize(('turns', 'buckles'), [(0.85, False), (1.15, True)])
+def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much(turns, buckles):
     """Greenhill: a clamped rod buckles at a torque of 8.987 EI / L; here just below and just above."""
     rest = np.full(42, 0.025)
-    for turns, buckles in ((0.85, False), (1.15, True)):
-        rod = Rod(rest, RodProperties(1e-3, 1e4, 0.05, 1.0, 0.02, torsion=1.0), 0.004)
-        rod.hold((0, 1, 41, 42))
-        points = straight(rest)
-        points[2:-2] += 1e-4 * np.random.default_rng(0).normal(size=(39, 3))
-        velocities = rod.velocities(points, np.zeros_like(points), NONE, np.zeros((4, 3)))
-        rod.state.spans['angle'][0] = angle = 8.987 * turns
-        # The frame of the last clamp is what holds it twisted.
-        frame, tangent = rod.state.spans['end_frame'][0], rod.state.spans['end'][0]
-        frame[:] = np.cos(angle) * frame + np.sin(angle) * np.cross(tangent, frame)
-        for _ in range(2500):
-            velocities = rod.velocities(points, velocities, NONE, np.zeros((4, 3)))
-            points = points + 0.004 * velocities
-        away = np.linalg.norm(points[:, 1:], axis=1).max()
-        # Between fixed ends it has little room to.
-        assert away > 2e-4 if buckles else away < 5e-5, away
+    rod = Rod(rest, RodProperties(1e-3, 1e4, 0.05, 1.0, 0.02, torsion=1.0), 0.004)
+    rod.hold((0, 1, 41, 42))
+    points = straight(rest)
+    points[2:-2] += 1e-4 * np.random.default_rng(0).normal(size=(39, 3))
+    rod.velocities(points, np.zeros_like(points), NONE, np.zeros((4, 3)))
+    rod.turned(points, {41: (8.987 * turns, 0, 0)})
+    velocities = np.zeros_like(points)
+    for _ in range(2500):
+        velocities = rod.velocities(points, velocities, NONE, np.zeros((4, 3)))
+        points = points + 0.004 * velocities
+    away = np.linalg.norm(points[:, 1:], axis=1).max()
+    # Between fixed ends it has little room to.
+    assert away > 2e-4 if buckles else away < 5e-5, away
 
 
 def test_torsion_changes_a_loop_between_two_clamps_and_nothing_else():

@@ -38,10 +38,8 @@ def rod_velocities(rod, points, velocities):
         block = (rod.stiffness[i] - across) * np.outer(segment, segment) / (segment @ segment)
         ends = np.kron([[1, -1], [-1, 1]], block + across * np.eye(3))
         matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += rod.implicit * ends
-    if len(rod.natural):
-        forces += natural_forces(points, rod.natural)
-    if len(rod.spans):
-        forces += twist_forces(points, rod.spans)
+    if len(rod.frame.angles):
+        forces += frame_forces(points, rod.frame)
     right = rod.masses[:, None] * velocities + rod.step * forces
     pull = HELD * rod.masses[rod.held, None]
     right[rod.held] += pull * rod.follow
@@ -63,33 +61,87 @@ def _forces(torques, tangents, lengths):
     return forces
 
 
-def natural_forces(points, moments):
-    """Return the forces of the natural curvature on the nodes, (N, 3) [N]; moments (N - 2,) [N m]."""
+def bends_along(points, start=None):
+    """
+    Return the tangents (N - 1, 3), a frame that goes along without twist, and the bends in it.
+
+    :param start: (3,) where the frame begins; None: anywhere.
+    :returns: tangents, frame (N - 1, 3), lengths (N - 1,) [m]; complex bends, half angles' cosines (N - 2,).
+    """
     segments = np.diff(points, axis=0)
     lengths = np.linalg.norm(segments, axis=1)
     tangents = segments / lengths[:, None]
     first, second = tangents[:-1], tangents[1:]
     half = np.sqrt(np.maximum((1 + np.einsum('ij,ij->i', first, second)) / 2, HAIRPIN))
-    directions = frame_along(tangents)
-    sideways = np.cross(tangents, directions)
-    bends = np.stack([np.einsum('ij,ij->i', second, axis[:-1]) for axis in (directions, sideways)]) / half
-    least = bends @ moments
-    least /= np.sqrt(least @ least + (ROUNDED * moments.mean())**2)
-    directions = least[0] * directions + least[1] * sideways
-    bend = (least @ bends) / (4 * half**2)
-    joints = np.cross(second, directions[:-1]) + np.cross(first, directions[1:])
-    joints = moments[:, None] * (joints / (2 * half[:, None]) + bend[:, None] * np.cross(first, second))
-    torques = np.zeros_like(segments)
+    frame = frame_along(tangents, start)
+    one, two = (np.einsum('ij,ij->i', second, axis[:-1]) for axis in (frame, np.cross(tangents, frame)))
+    return tangents, frame, lengths, (one + 1j * two) / half, half
+
+
+def frame_forces(points, state):
+    """Return the forces of the material frame on the nodes, (N, 3) [N], at the angles that it has."""
+    tangents, frame, lengths, bends, half = bends_along(points, state.carried[1])
+    natural = state.natural[:, 0] + 1j * state.natural[:, 1]
+    if len(state.twisting):
+        natural = natural * np.exp(0.5j * (state.angles[1:] + state.angles[:-1]))
+        twists = state.twisting * np.diff(state.angles)
+    else:  # it turns freely as a whole
+        total = natural.conj() @ bends
+        natural = natural * total / np.hypot(abs(total), ROUNDED * np.abs(natural).mean())
+        slopes = np.imag(natural * bends.conj()) / 2
+        twists = np.cumsum(slopes) + np.concatenate([[0.0], np.cumsum(slopes)[:-1]])
+    sideways = np.cross(tangents, frame)
+    first, second = tangents[:-1], tangents[1:]
+    here = natural.real[:, None] * frame[:-1] + natural.imag[:, None] * sideways[:-1]
+    there = natural.real[:, None] * frame[1:] + natural.imag[:, None] * sideways[1:]
+    joints = (np.cross(second, here) + np.cross(first, there)) / (2 * half[:, None])
+    joints += (np.real(natural.conj() * bends) / (4 * half**2))[:, None] * np.cross(first, second)
+    joints -= (twists / (2 * half**2))[:, None] * (first + second)
+    torques = np.zeros_like(tangents)
     torques[1:] += joints
     torques[:-1] -= joints
-    against_twist = np.cumsum(-np.einsum('ij,ij->i', torques, tangents)[:-1]) / half
-    axes = (against_twist / (2 * half))[:, None] * (first + second)
-    torques[1:] -= axes
-    torques[:-1] += axes
-    return _forces(torques, tangents, lengths)
+    couples = np.cross(torques, tangents) / lengths[:, None]
+    forces = np.zeros_like(points)
+    forces[1:] += couples
+    forces[:-1] -= couples
+    return forces
 
 
-def frame_along(tangents):
+def least_energy(points, state, clamps=(), near=None):
+    """
+    Return the energy [J] of the material frame at the angles of least energy, and these angles.
+
+    :param clamps: pairs of a segment and a unit vector (3,) of the frame there.
+    :param near: (N - 1,) [rad] angles to begin with; None: those of the state.
+    """
+    _, frame, _, bends, _ = bends_along(points, state.carried[1])
+    tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
+    natural = state.natural[:, 0] + 1j * state.natural[:, 1]
+    if not len(state.twisting):
+        return -np.hypot(abs(natural.conj() @ bends), ROUNDED * np.abs(natural).mean()), None
+    angles = np.array(state.angles if near is None else near)
+    for segment, direction in clamps:
+        angle = _angle(frame[segment], direction, tangents[segment])
+        angles[segment] = angle + 2 * np.pi * np.round((angles[segment] - angle) / (2 * np.pi))
+    free = np.setdiff1d(np.arange(len(angles)), [segment for segment, _ in clamps])
+    difference = np.diff(np.eye(len(angles)), axis=0)
+    mean = np.abs(difference) / 2
+    for _ in range(20):
+        turned = natural * np.exp(1j * mean @ angles)
+        slope = difference.T @ (state.twisting * (difference @ angles))
+        slope += mean.T @ np.imag(turned * bends.conj())
+        curvature = difference.T @ np.diag(state.twisting) @ difference
+        curvature += mean.T @ np.diag(np.real(turned * bends.conj())) @ mean
+        move = np.linalg.lstsq(curvature[np.ix_(free, free)], slope[free], rcond=1e-12)[0]
+        angles[free] -= move
+        if np.abs(move).max() < 1e-7:
+            break
+    turned = natural * np.exp(1j * mean @ angles)
+    twist = (state.twisting * (difference @ angles)**2).sum() / 2
+    return twist - np.real(turned * bends.conj()).sum(), angles
+
+
+def frame_along(tangents, start=None):
     """Return (N - 1, 3) unit vectors perpendicular to the tangents that do not twist about them."""
     some = np.cross(tangents, np.eye(3)[np.abs(tangents).argmin(axis=1)])
     some /= np.linalg.norm(some, axis=1, keepdims=True)
@@ -98,41 +150,10 @@ def frame_along(tangents):
     between = np.maximum(1 + np.einsum('ij,ij->i', first, second), 2 * HAIRPIN)
     there = some[:-1] - (np.einsum('ij,ij->i', second, some[:-1]) / between)[:, None] * (first + second)
     turned = np.arctan2(np.einsum('ij,ij->i', there, other[1:]), np.einsum('ij,ij->i', there, some[1:]))
-    angles = np.concatenate([[0.0], np.cumsum(turned)])[:, None]
+    begin = 0.0 if start is None else _angle(some[0], start, tangents[0])
+    angles = begin + np.concatenate([[0.0], np.cumsum(turned)])[:, None]
     # The angle from `some` of a vector that goes along without twist grows by what `some` lags behind it.
     return np.cos(angles) * some + np.sin(angles) * other
-
-
-def twist_forces(points, spans):
-    """Return the forces of twist on the nodes, (N, 3) [N]; brings the spans up to date."""
-    segments = np.diff(points, axis=0)
-    lengths = np.linalg.norm(segments, axis=1)
-    tangents = segments / lengths[:, None]
-    torques = np.zeros_like(segments)
-    for span in spans:
-        a, b = span['first'], span['last']
-        part = tangents[a:b + 1]
-        frame = frame_along(part)
-        if not span['begun']:
-            span['begun'] = 1
-            span['start'], span['start_frame'], span['end'], span['end_frame'] = (
-                part[0], frame[0], part[-1], frame[-1])
-        here = _turned(span['start'], span['start_frame'], part[0])
-        there = _turned(span['end'], span['end_frame'], part[-1])
-        angle = _angle(frame[-1], there, part[-1]) - _angle(frame[0], here, part[0])
-        angle += 2 * math.pi * round((span['angle'] - angle) / (2 * math.pi))
-        span['angle'] = angle
-        both = part[:-1] + part[1:]
-        joints = span['stiffness'] * angle * both / np.maximum(
-            np.einsum('ij,ij->i', both, both) / 2, 2 * HAIRPIN)[:, None]
-        torques[a + 1:b + 1] -= joints
-        torques[a:b] += joints
-    return _forces(torques, tangents, lengths)
-
-
-def _turned(before, direction, tangent):
-    """Turn the direction of a clamp by the smallest rotation from its tangent to another, (3,) each."""
-    return direction - tangent @ direction / max(1 + tangent @ before, 2 * HAIRPIN) * (tangent + before)
 
 
 def _angle(first, second, tangent):

@@ -4,21 +4,45 @@
 """Single steps of the kernels, for tests."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.rod import Rod
 from dlo_calibration.simulation.rope import self_contact
 
+NO_TURNS = np.zeros((0, 9))
+
 
 class SteppedRod(Rod):
     """A rod whose kernel is called step by step."""
 
-    def velocities(self, points, velocities, gravity, held_velocities):
+    def velocities(self, points, velocities, gravity, held_velocities, turns=NO_TURNS):
         """Return the (N, 3) [m/s] velocities after a step without contacts."""
         self.state.follow[:] = held_velocities
         wanted = np.empty_like(points)
-        assert kernels.rod_velocities(self.state, points, velocities + self.state.step * gravity, wanted)
+        pushed = velocities + self.state.step * gravity
+        assert kernels.rod_velocities(self.state, points, pushed, turns, wanted)
         return wanted
+
+    def frame_forces(self, points, times=1):
+        """Return the (N, 3) [N] forces of the material frame, after so many steps at the same points."""
+        for _ in range(times):
+            self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.state.held), 3)))
+        impulses = np.zeros(points.size)
+        if len(self.state.frame.angles):
+            kernels.add_frame(self.state.frame, NO_TURNS, 1.0, impulses)
+        return impulses.reshape(-1, 3)
+
+    def turned(self, points, axes):
+        """Turn clamps by rotation vectors (3,), given by held node; what they hold stays where it is."""
+        pieces = 1 + int(max((np.linalg.norm(axis) for axis in axes.values()), default=0))
+        rotations = np.tile(np.eye(3), (len(self.state.held), 1, 1))
+        for place, node in enumerate(self.state.held):
+            if node in axes:
+                rotations[place] = Rotation.from_rotvec(np.array(axes[node]) / pieces).as_matrix()
+        still = np.zeros((len(self.state.held), 3))
+        for _ in range(pieces):
+            self.velocities(points, np.zeros_like(points), np.zeros(3), still, rotations.reshape(-1, 9))
 
 
 class Touching:
