@@ -17,10 +17,11 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import SCALE
+from dlo_calibration.model.parameters import PAPER_PARAMETERS, SCALE
 
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first: each level uses the points of the one before
 NARROWEST = 10.0  # a slice extends at least this far to each side (0..100)
+MOST_LINES = 6  # more parameters would take too long to simulate, and to look at
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,9 @@ class Plane:
 @dataclass(frozen=True)
 class Slices:
     """
-    A line through the found values for each parameter, and planes for the most correlated pairs.
+    Lines through the found values, and planes for the most correlated pairs of parameters.
 
+    :param lines: for each parameter, or `chosen` ones of many.
     :param evaluations: number of parameter sets that were simulated.
     :param complete: False if the time was too short: some slices are coarse or missing.
     """
@@ -87,12 +89,12 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     """
     end = clock() + seconds
     grid = _Grid(evaluator, best, std, lambda: should_stop() or clock() > end)
-    dimension = evaluator.space.dimension
+    dimension, varied = evaluator.space.dimension, chosen(evaluator.space.free, std)
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()
     try:
         for level in LEVELS:
-            lines = tuple(grid.line(k, level) for k in range(dimension))
+            lines = tuple(grid.line(k, level) for k in varied)
             if level <= 8:  # a plane of 16 intervals would take four times as long
                 planes = tuple(grid.plane(pair, level) for pair in pairs(dimension, examination))
     except CancelledError:
@@ -103,6 +105,13 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
 def seconds_for(calibration: float) -> float:
     """Return the time limit of the slices [s]: a fifth of that of the calibration [s], but 5 to 60 s."""
     return min(max(5.0, 0.2 * calibration), 60.0)
+
+
+def chosen(names: Sequence[str], std: Floats) -> list[int]:
+    """Return the indices of the paper's parameters and of the least certain others, `MOST_LINES` at most."""
+    others = [k for k in np.argsort(-std, kind='stable').tolist() if names[k] not in PAPER_PARAMETERS]
+    first = [k for k, name in enumerate(names) if name in PAPER_PARAMETERS]
+    return sorted((first + others)[:MOST_LINES])
 
 
 def pairs(dimension: int, examination: Examination | None) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
+from itertools import combinations
 from pathlib import Path
 import platform
 import shlex
@@ -20,16 +21,18 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import printable
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.model.parameters import BY_NAME
-from dlo_calibration.model.quantity import exact, interval, measured, number
+from dlo_calibration.model.quantity import exact, measured, number
 from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
+from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
+from dlo_calibration.report.rows import parameter_rows
 from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences
 from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.writing import whole
 
 MOST_TRIALS = 12  # are drawn, so that the page stays small
+MOST_CORRELATIONS = 12  # parameters of a table of all; of more, as many pairs are listed
 
 
 @dataclass(frozen=True)
@@ -85,11 +88,13 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
                               keep_trailing_newline=True,
                               finalize=lambda value: printable(value) if type(value) is str else value)
     environment.filters.update(number=number, exact=exact, squared=lambda text: text.replace('m^2', 'm²'))
-    environment.globals.update(measured=measured, interval=interval)
+    environment.globals.update(measured=measured)
     values = plain(result)
     page = environment.get_template('page.html').render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
-        quantities={name: BY_NAME[name].quantity for name in values['parameters']},
+        rows=parameter_rows(values['parameters'], result.space),
+        correlated=most_correlated(values['correlations']),
+        rest_shapes=rest_shape_panels(result), moments=moment_panels(result),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
         **_trials(result), convergence=convergence_panel(result),
@@ -103,6 +108,14 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
         declarations=list(declarations()))
     with whole(path) as new:
         new.write_text(page, encoding='utf-8')
+
+
+def most_correlated(correlations: Mapping[str, Mapping[str, float]] | None) -> list[tuple[str, str, float]]:
+    """Return the pairs of parameters with the largest correlations if there are too many for a table."""
+    if correlations is None or len(correlations) <= MOST_CORRELATIONS:
+        return []
+    pairs = [(one, other, correlations[one][other]) for one, other in combinations(correlations, 2)]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))[:MOST_CORRELATIONS]
 
 
 def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, float | None]:

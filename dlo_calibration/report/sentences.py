@@ -11,23 +11,28 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.model.parameters import BY_NAME, PER_WEIGHT, SCALE
+from dlo_calibration.model.parameters import BY_NAME, knot_names, PER_WEIGHT, SCALE
 from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.report.bending_sentences import friction_sentences, rest_shape_sentences
 
 #: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
 MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
+MOST_COMBINATIONS = 3  # of parameters that the trials do not determine are told
 
 
 def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
-    return [*_known(result), *_undetermined(result), *_uninformative(result), *_advice(result), *_fit(result),
+    return [*_known(result), *rest_shape_sentences(result), *friction_sentences(result),
+            *_undetermined(result), *_uninformative(result), *_advice(result), *_fit(result),
             *_missing_parameters(result)]
 
 
 def _known(result: CalibrationResult) -> list[str]:
-    """Return a sentence on each parameter, the most certain ones first."""
+    """Return a sentence on each parameter but the knots of the rest shape, the most certain ones first."""
     found: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
-    for name, p in result.parameters.items():
+    alone = [name for name in result.parameters if name not in knot_names(result.space.knots)]
+    for name in alone:
+        p = result.parameters[name]
         verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
         quantity = BY_NAME[name].quantity
         value = measured(p.physical_value, p.physical_unit)
@@ -52,8 +57,10 @@ def _known(result: CalibrationResult) -> list[str]:
 
 
 def _undetermined(result: CalibrationResult) -> list[str]:
-    return [f'This combination of parameters can change while the fit stays nearly the same: {words}.'
-            for words in result.undetermined]
+    found = result.undetermined
+    more = [f'So can {len(found) - MOST_COMBINATIONS} more combinations.'] * (len(found) > MOST_COMBINATIONS)
+    return [*(f'This combination of parameters can change while the fit stays nearly the same: {words}.'
+              for words in found[:MOST_COMBINATIONS]), *more]
 
 
 def _uninformative(result: CalibrationResult) -> list[str]:

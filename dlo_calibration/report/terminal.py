@@ -17,10 +17,12 @@ from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import shortened, told
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.planning.planner import PlanProgress
 from dlo_calibration.report import sentences
+from dlo_calibration.report.rows import parameter_rows
 
 LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
 
@@ -134,17 +136,14 @@ class PlanBar:
                               action=progress.actions, how=how)
 
 
-def parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return a table of parameters in both units, from the rows in the plain values of a result."""
+def parameter_table(parameters: Mapping[str, Mapping[str, Any]], space: ParameterSpace) -> Table:
+    """Return a table of parameters in both units, from their plain values in a result."""
     table = Table(title='parameters')
     for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'verdict'):
         table.add_column(title, justify='left' if title in ('parameter', 'verdict') else 'right')
-    for name, row in parameters.items():
-        unit = row['physical_unit']
-        table.add_row(
-            escape(name), number(row['value']), interval(row['lower'], row['upper'], '1'),
-            escape(measured(row['physical_value'], unit)),
-            escape(interval(row['physical_lower'], row['physical_upper'], unit)), escape(row['verdict']))
+    for row in parameter_rows(parameters, space):
+        table.add_row(*map(escape, (row.name, row.value, row.ends, row.physical, row.physical_ends,
+                                    row.verdict)))
     return table
 
 
@@ -201,7 +200,7 @@ def print_result(result: CalibrationResult, stream: TextIO,
     out, values = console(stream), {**plain(result), **how}
     if values['choice']:
         out.print(escape(values['choice']))
-    out.print(parameter_table(values['parameters']))
+    out.print(parameter_table(values['parameters'], result.space))
     out.print(facts_table('fit', fit_facts(values)))
     for sentence in sentences.sentences(result):
         out.print(escape(sentence))

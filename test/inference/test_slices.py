@@ -14,7 +14,15 @@ from toy_simulator import new_toy, ToySimulator
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.inference.slices import LEVELS, NARROWEST, pairs, seconds_for, simulate_slices
+from dlo_calibration.inference.slices import (
+    chosen,
+    LEVELS,
+    MOST_LINES,
+    NARROWEST,
+    pairs,
+    seconds_for,
+    simulate_slices,
+)
 
 
 @pytest.fixture(scope='module')
@@ -41,6 +49,14 @@ def test_a_line_per_parameter_whose_lowest_error_is_at_the_truth(result):
         assert line.values[-1] - line.values[0] >= NARROWEST
         assert 0 <= line.values[0] and line.values[-1] <= 100
     assert slices.complete
+
+
+def test_of_many_parameters_the_papers_and_the_least_certain_have_lines():
+    names = ['damping', 'friction', 'torsion', 'mass', 'marker_mass', 'flexibility', 'elasticity',
+             'self_collision']
+    std = np.array([0.2, 0.01, 0.1, 0.01, 0.15, 0.01, 0.01, 0.01])
+    assert chosen(names, std) == [0, 1, 4, 5, 6, 7]
+    assert chosen(names[:MOST_LINES], std[:MOST_LINES]) == list(range(MOST_LINES))
 
 
 def test_errors_are_those_of_the_simulator(result):

@@ -4,13 +4,13 @@
 """Pages without what takes long, for tests of something else: a drawing takes a tenth of a second."""
 
 from dlo_calibration.calibration import stages
-from dlo_calibration.report import drawing, landscape
+from dlo_calibration.report import bending_drawing, drawing, landscape
 from dlo_calibration.report.figure import Panel
 
 
 def leave_out_drawings(replace=setattr):
     """Let the page of a result have its words only; `replace` sets an attribute of a module."""
-    for module in (drawing, landscape):
+    for module in (bending_drawing, drawing, landscape):
         replace(module, 'panel', lambda draw, words, legend=True: Panel('data:,', words))
 
 

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A result with a rest shape of nine knots, thirty parameters in all, is told in every form, and readable."""
+
+import base64
+from dataclasses import replace
+import io
+import json
+import re
+
+from lxml import etree
+import numpy as np
+import pytest
+from remembering import remembering_result, remembering_space
+from result_message import result_values
+from toy_messages import toy_trials
+from toy_simulator import new_toy, ToySimulator
+
+from dlo_calibration import calibrate
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.plain import plain
+from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.files.evaluations import write_evaluations
+from dlo_calibration.files.result import description_document, read_description
+from dlo_calibration.inference.slices import MOST_LINES, simulate_slices
+from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
+from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.model.parameters import knot_names
+from dlo_calibration.planning.dlo import Posterior
+from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
+from dlo_calibration.report.page import MOST_CORRELATIONS, Origin, write_report
+from dlo_calibration.report.sentences import sentences
+from dlo_calibration.report.terminal import print_result
+from dlo_calibration.ros import diagnostics
+
+
+@pytest.fixture(scope='module')
+def result():
+    """Return a result with thirty parameters."""
+    found = remembering_result()
+    assert len(found.parameters) == 30
+    return found
+
+
+@pytest.fixture(scope='module')
+def straight():
+    """Return a result of a DLO that remembers nothing."""
+    return calibrate(toy_trials(1), Options.of({'workers': 1, 'evaluations': 10}), make_simulator=new_toy)
+
+
+def test_the_file_has_all_of_it(result, tmp_path):
+    document = description_document(result)
+    found = read_description(document)
+    assert found.physical() == result.physical()
+    assert found.space.knots == 9
+    assert found.correlations == result.correlations
+    assert found.parameters['rest_curvature_y4'] == result.parameters['rest_curvature_y4']
+    assert description_document(found) == document
+    write_evaluations(tmp_path / 'evaluations.csv', result)
+    assert 'rest_curvature_y9' in (tmp_path / 'evaluations.csv').read_text().splitlines()[0]
+
+
+def test_a_file_from_before_there_was_memory_is_read(straight):
+    root = etree.fromstring(description_document(straight))
+    parameters = root.find('parameters')
+    for element in parameters.findall('fixed'):
+        if element.get('name').startswith('bending_'):
+            parameters.remove(element)
+    found = read_description(etree.tostring(root))
+    assert found.physical() == straight.physical()
+    assert not found.physical()['bending_friction']
+
+
+def test_json_and_message_have_every_component(result):
+    told = json.loads(json.dumps(plain(result), allow_nan=False))
+    message = diagnostics.result(bag_types(), result, stamp=1)
+    values = result_values(message)
+    for name in knot_names(9):
+        assert told['parameters'][name]['value'] == result.values[name] == values[name]['value']
+    assert len(message.status) == 31
+
+
+def test_the_table_has_a_line_for_each_knot(result):
+    stream = io.StringIO()
+    print_result(result, stream)
+    lines = stream.getvalue().splitlines()
+    assert [line for line in lines if 'rest_curvature 4' in line and '4.99, 3.99 1/m' in line]
+    assert sum('rest_curvature' in line.split('│')[1] for line in lines if '│ ' in line) == 9
+    assert all(len(line) <= 110 for line in lines)
+
+
+def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
+    told = sentences(result)
+    shape, = (text for text in told if text.startswith('When nothing bends it'))
+    assert 'most at 38 % of its length, by 6.38 1/m (a radius of 157 mm)' in shape
+    assert 'Of the 18 components of this rest shape, rest_curvature_x1 to rest_curvature_y9, ' \
+           '17 are known well, 1 only roughly.' in told
+    kept, = (text for text in told if text.startswith('Bent far and released'))
+    assert '2.01 1/m (a radius of 497 mm)' in kept and 'more than 0.299 1/m' in kept
+    assert not any(text.startswith('rest_curvature') for text in told)
+    assert len(told) < 25
+
+
+def test_what_is_not_known_is_not_claimed(result):
+    friction = replace(result.parameters['bending_friction'], verdict=NOT_IDENTIFIABLE, identifiable=False)
+    changed = replace(result, parameters={**result.parameters, 'bending_friction': friction})
+    assert not any(text.startswith('Bent far') for text in sentences(changed))
+
+
+def test_draws_are_whole_ropes_within_the_scale(result):
+    posterior = Posterior.of(read_description(description_document(result)))
+    draws = posterior.draws(200, seed=3)
+    assert all(set(one) == set(result.physical()) for one in draws)
+    for name in knot_names(9):
+        values = [one[name] for one in draws]
+        inside = result.parameters[name]
+        share = np.mean([inside.physical_lower <= value <= inside.physical_upper for value in values])
+        assert 0.8 < share <= 1 and max(map(abs, values)) <= 25
+    drawn = np.array([[one[name] for name in ('rest_curvature_x2', 'rest_curvature_y2')] for one in draws])
+    expected = result.correlations['rest_curvature_x2']['rest_curvature_y2']
+    assert np.corrcoef(drawn.T)[0, 1] == pytest.approx(expected, abs=0.2)
+
+
+def test_the_page_stays_small(result, tmp_path, without_drawings):
+    evaluator = Evaluator(result.trials, result.space, ToySimulator())
+    slices = simulate_slices(evaluator, result.best, result.std, result.examination, seconds=60)
+    assert len(slices.lines) == MOST_LINES and slices.complete
+    write_report(tmp_path / 'page.html', result, Origin('s', 'a command', Options()), slices)
+    page = (tmp_path / 'page.html').read_text(encoding='utf-8')
+    assert 'rest_curvature 9' in page and 'The shape when nothing bends it' in page
+    assert 'The bend that it keeps' in page
+    assert 'class="cells"' not in page and page.count('<tr><td>') > MOST_CORRELATIONS
+    assert len(page) < 2e5
+
+
+def test_drawings_are_images(result):
+    for one in (*rest_shape_panels(result), *moment_panels(result)):
+        svg = base64.b64decode(one.source.partition(',')[2])
+        assert etree.fromstring(svg) is not None and len(svg) < 2e5
+
+
+def test_drawings_show_what_there_is(result, straight, without_drawings):
+    shape, _ = rest_shape_panels(result)
+    assert re.search(r'1000 mm long: its ends are \d+ mm apart', shape.words)
+    moment, = moment_panels(result)
+    assert 'mN m,' in moment.words and '2.01 1/m of curvature stay' in moment.words
+    moment, = moment_panels(replace(result, space=remembering_space(mass=0.0)))
+    assert 'mN m per N/m,' in moment.words
+    assert rest_shape_panels(straight) == moment_panels(straight) == []
