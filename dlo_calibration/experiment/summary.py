@@ -108,7 +108,7 @@ def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:
         return Spread.of([value for value in values if value is not None])
 
     def parameter(name: str) -> Spread | None:
-        return Spread.of([outcome.values[name] for outcome in whole])
+        return Spread.of([outcome.values[name] for outcome in whole if name in outcome.values])
 
     free = subject.observed.options.space.free
     return Findings(

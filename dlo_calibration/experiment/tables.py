@@ -17,6 +17,7 @@ from dlo_calibration.calibration.plain import known
 from dlo_calibration.experiment.outcome import Outcome
 from dlo_calibration.experiment.study import Task
 from dlo_calibration.experiment.summary import complete_runs, Findings, Spread
+from dlo_calibration.model.parameters import knot_names, KNOTS
 from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.figure import (
@@ -85,6 +86,8 @@ def markdown(account: Account) -> str:
     parts += ['## Consistency', 'Average and standard deviation of each parameter over the runs, on the '
               'scale from 0 to 100, calibrated on all trials.  *Italic*: the trials do not inform about this '
               'parameter, so it keeps its default; if a number of runs is given, they do in these runs only.']
+    if any(name in knot_names(KNOTS[-1]) for one in account.findings for name in one.parameters):
+        parts.append('The components of rest shapes are in `consistency.csv`.')
     if account.samples:
         parts.append(f'In the paper, parameters scatter by {PAPER_SCATTER[0]:g} to {PAPER_SCATTER[1]:g} '
                      f'over the runs; its figures for each object are {UNKNOWN}.')
@@ -146,7 +149,7 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
     """
     subjects = list(dict.fromkeys(group[0][0].subject.name for group in done))
     searches = list(dict.fromkeys(group[0][0].search for group in done))
-    names = list(dict.fromkeys(name for group in done for name in group[0][0].options.space.free))
+    names = _in_tables(name for group in done for name in group[0][0].options.space.free)
     figure = blank_figure(max(7.0, 2.0 + 2.0 * len(subjects)), 1.0 + 2.4 * len(names))
     rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for group in done:
@@ -175,7 +178,7 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
 
 
 def _consistency(findings: Sequence[Findings]) -> str:
-    names = list(dict.fromkeys(name for one in findings for name in one.parameters))
+    names = _in_tables(name for one in findings for name in one.parameters)
     rows: list[list[str]] = []
     for one in findings:
         average, deviation = [one.subject, 'average'], ['', 'standard deviation']
@@ -191,6 +194,11 @@ def _consistency(findings: Sequence[Findings]) -> str:
             deviation.append(std)
         rows += [average, deviation]
     return _table(('object', '', *names), rows)
+
+
+def _in_tables(names: Iterable[str]) -> list[str]:
+    """Return each name once, without the many components of rest shapes, which the CSV has."""
+    return [name for name in dict.fromkeys(names) if name not in knot_names(KNOTS[-1])]
 
 
 def _validity(account: Account) -> str:

@@ -24,7 +24,7 @@ from dlo_calibration.inference.advice import sensitivity
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.uncertainty import prior_information, UNKNOWN_STD
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.parameters import knot_names, KNOTS, ParameterSpace, SCALE
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
@@ -108,14 +108,19 @@ class TrialInformation:
         improved = self.improved
         if not improved:
             return f'{self.trial} adds nothing new: repeat it only to average noise'
-        shown = ', '.join(
-            f'{name}{" more certain" * (name == improved[0])} '
-            f'(± {SCALE * before:.1f} -> ± {SCALE * after:.1f} of 100)'
-            for name, before, after in zip(self.names, self.before, self.after, strict=True)
-            if name in improved)
-        rest = ', '.join(name for name in self.names if name not in improved)
-        nothing = f'; it adds nothing about {rest}' if rest else ''
-        return f'{self.trial} makes {shown}{nothing}'
+        knots = [name for name in self.names if name in knot_names(KNOTS[-1])]
+        certain = [f'{name} (± {SCALE * before:.1f} -> ± {SCALE * after:.1f} of 100)'
+                   for name, before, after in zip(self.names, self.before, self.after, strict=True)
+                   if name in improved and name not in knots]
+        rest = [name for name in self.names if name not in improved and name not in knots]
+        if knots:  # up to 18 of them
+            bent = sum(name in improved for name in knots)
+            where = certain if bent else rest
+            where.append(f'{bent} of {len(knots)} components of the rest shape' if bent else 'the rest shape')
+        first, _, values = certain[0].partition(' (')
+        certain[0] = f'{first} more certain' + (f' ({values}' if values else '')
+        nothing = f'; it adds nothing about {", ".join(rest)}' if rest else ''
+        return f'{self.trial} makes {", ".join(certain)}{nothing}'
 
     @property
     def values(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from dlo_calibration.experiment.tables import (
     scatter_picture,
     validity_csv,
 )
+from dlo_calibration.model.parameters import knot_names
 
 DONE = [*outcomes(1, 60.0, (10.0, 50.0)), *outcomes(2, 70.0, (40.0, 80.0)), *outcomes(3, 80.0, (20.0, 40.0))]
 FINDINGS = summary(DONE)
@@ -45,6 +46,18 @@ def test_consistency_has_an_average_and_a_deviation_for_each_parameter():
     average, *_ = cells(text, 'rope')
     assert average == ['rope', 'average', '70', '*25*']  # nothing told its elasticity
     assert cells(text, '')[0] == ['', 'standard deviation', '10', '*0*']
+
+
+def test_components_of_a_rest_shape_are_in_the_csv_only():
+    spread = FINDINGS.parameters['friction']
+    names = knot_names(9)
+    bent = replace(FINDINGS, parameters={**FINDINGS.parameters, **dict.fromkeys(names, spread)},
+                   informed={**FINDINGS.informed, **dict.fromkeys(names, 3)})
+    account = replace(ACCOUNT, findings=(bent,))
+    text = markdown(account)
+    assert 'components of rest shapes are in `consistency.csv`' in text
+    assert 'rest_curvature' not in text
+    assert {row['parameter'] for row in table(consistency_csv(account))} >= set(names)
 
 
 def test_a_parameter_that_some_runs_told_says_so():

@@ -20,7 +20,7 @@ from dlo_calibration.inference.trial_information import (
     without_repeated_goals,
 )
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import knot_names, ParameterSpace
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import Rollout
 
@@ -63,6 +63,22 @@ def test_the_standard_deviation_after_a_trial_is_that_of_linear_regression():
     known = posterior([FIRST], SPACE, 0.0)
     after = known.after(simulated_information(FIRST, known, SPACE, ToySimulator(), 1.0, 0.0))
     assert after.std == pytest.approx((12 + SQUARES / known.scale**2)**-0.5, rel=1e-6)
+
+
+def test_components_of_a_rest_shape_are_counted():
+    names = ('flexibility', *knot_names(3), 'damping')
+    before = np.full(8, 0.2)
+
+    def words(*shares):
+        return TrialInformation('trial 1', names, before, before * shares).words
+
+    assert words(0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.5, 0.9) == (
+        'trial 1 makes flexibility more certain (± 20.0 -> ± 10.0 of 100), 5 of 6 components of the rest '
+        'shape; it adds nothing about damping')
+    assert words(1, *[0.5] * 6, 1) == (
+        'trial 1 makes 6 of 6 components of the rest shape more certain; it adds nothing about flexibility, '
+        'damping')
+    assert words(0.5, *[1] * 7).endswith('it adds nothing about damping, the rest shape')
 
 
 def test_rougher_chains_tell_less():
