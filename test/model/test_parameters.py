@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import pytest
 
 from dlo_calibration import InputError
-from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, ParameterSpace, PART_NAMES, REST_SHAPE
 
 PAPER = ('flexibility', 'elasticity', 'friction', 'self_collision')
 WEIGHT = 0.05 * 9.81  # N/m, of a DLO whose mass is not known
@@ -72,7 +72,7 @@ def test_a_point_of_the_cube_and_the_values_of_its_parameters():
 def test_physical_values_are_the_found_ones_then_the_fixed_ones_then_the_defaults():
     space = ParameterSpace(('flexibility',), {'friction': 10.0})
     physical = space.physical({'flexibility': 60.0}, length=1.0)
-    assert set(physical) == {name for name in BY_NAME if not name.startswith('stiffness_')}
+    assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *REST_SHAPE}
     assert physical['flexibility'] == pytest.approx(MAPPING['flexibility'](60), rel=1e-12)
     assert physical['friction'] == pytest.approx(MAPPING['friction'](10), rel=1e-12)
     assert physical['elasticity'] == pytest.approx(
@@ -81,8 +81,8 @@ def test_physical_values_are_the_found_ones_then_the_fixed_ones_then_the_default
 
 def test_more_of_the_object_is_off_by_default_exactly():
     physical = ParameterSpace().physical({}, length=1.0)
-    names = ('length_scale', 'natural_curvature', 'marker_mass', 'torsion')
-    assert [physical[name] for name in names] == [1, 0, 0, 0]
+    names = ('length_scale', 'natural_curvature', 'marker_mass', 'torsion', 'bending_friction')
+    assert [physical[name] for name in names] == [1, 0, 0, 0, 0]
     parts = ParameterSpace().divided(8).physical({}, length=1.0)
     assert [parts[f'stiffness_{part}'] for part in range(2, 9)] == [1] * 7
     assert BY_NAME['length_scale'].value(1.0) == 50
