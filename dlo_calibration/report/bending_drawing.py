@@ -32,24 +32,21 @@ def rest_shape_panels(result: CalibrationResult) -> list[Panel]:
         return []
     shape, = _shapes([physical], length, FINE)
     drawn = _shapes(Posterior.of(result).draws(DRAWS, seed=0), length, COARSE)
-    centre = shape.mean(axis=0)
-    axes = np.linalg.svd(shape - centre, full_matrices=False)[2]  # of least squares, the longest one first
-    along = np.sign(axes @ (shape[-1] - shape[0]))
-    shape = (shape - centre) @ (axes * np.where(along < 0, -1.0, 1.0)[:, None]).T
-    places = np.linspace(0, len(shape) - 1, drawn.shape[1])
-    fine = np.arange(len(shape))
-    reference = np.stack([np.interp(places, fine, values) for values in shape.T], axis=1)
-    moved = np.array([_moved_onto(one, reference) for one in drawn])
-    apart = np.square(moved - reference).sum(axis=(1, 2))
-    moved = moved[np.argsort(apart, kind='stable')[:KEPT]]
-    chord, depth = (float(np.linalg.norm(shape[-1] - shape[0])), float(np.ptp(shape[:, 2])))
-    words = (f'The rest shape, {measured(length, "m")} long: its ends are {measured(chord, "m")} apart, and '
-             f'it leaves its plane by {measured(depth, "m")}')
-    return [panel(lambda one: _draw_shape(one, shape[:, :2], moved[..., :2], 'rest shape, in its plane'),
-                  f'{words}; in its plane'),
-            panel(lambda one: _draw_shape(one, shape[:, ::2], moved[..., ::2],
-                                          'rest shape, looking along its plane'),
-                  f'{words}; looking along its plane', legend=False)]
+    shape = (shape - shape.mean(axis=0)) @ _best_axes(shape)
+    places, fine = np.linspace(0, len(shape) - 1, drawn.shape[1]), np.arange(len(shape))
+    same = np.stack([np.interp(places, fine, values) for values in shape.T], axis=1)
+    moved = np.array([_moved_onto(one, same) for one in drawn])
+    moved = moved[np.argsort(np.square(moved - same).sum(axis=(1, 2)), kind='stable')[:KEPT]]
+    words = (f'The rest shape, {measured(length, "m")} long: its ends are '
+             f'{measured(float(np.linalg.norm(shape[-1] - shape[0])), "m")} apart, and it extends '
+             f'{measured(float(np.ptp(shape[:, 2])), "m")} across the plane that fits it best')
+
+    def view(axes: list[int], title: str, legend: bool) -> Panel:
+        return panel(lambda one: _draw_shape(one, shape[:, axes], moved[..., axes], title),
+                     f'{words}; {title}', legend)
+
+    return [view([0, 1], 'rest shape, on the plane that fits it best', legend=True),
+            view([0, 2], 'rest shape, from the side', legend=False)]
 
 
 def moment_panels(result: CalibrationResult) -> list[Panel]:
@@ -109,6 +106,14 @@ def _shapes(drawn: Sequence[dict[str, float]], length: float, pieces: int) -> Fl
     curvatures = np.array([natural_curvature(one, places) * one['length_scale'] for one in drawn])
     lengths = np.array([one['length_scale'] for one in drawn])
     return np.asarray(rest_shape(curvatures, length) * lengths[:, None, None])
+
+
+def _best_axes(shape: Floats) -> Floats:
+    """Return right-handed axes, the columns of (3, 3): a shape extends most along the first of them."""
+    first, second, _ = np.linalg.svd(shape - shape.mean(axis=0), full_matrices=False)[2]
+    first = first * (1.0 if first @ (shape[-1] - shape[0]) >= 0 else -1.0)  # the first point is on the left
+    second = second * (1.0 if second[np.argmax(np.abs(second))] > 0 else -1.0)  # as a sign is arbitrary
+    return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
 def _moved_onto(points: Floats, target: Floats) -> Floats:

@@ -28,7 +28,12 @@ from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import knot_names
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
+from dlo_calibration.report.bending_drawing import (
+    _best_axes,
+    _moved_onto,
+    moment_panels,
+    rest_shape_panels,
+)
 from dlo_calibration.report.page import MOST_CORRELATIONS, Origin, write_report
 from dlo_calibration.report.sentences import sentences
 from dlo_calibration.report.terminal import print_result
@@ -148,3 +153,18 @@ def test_drawings_show_what_there_is(result, straight, without_drawings):
     moment, = moment_panels(replace(result, space=remembering_space(mass=0.0)))
     assert 'mN m per N/m,' in moment.words
     assert rest_shape_panels(straight) == moment_panels(straight) == []
+
+
+def test_a_shape_is_drawn_from_its_side_without_a_mirror():
+    """A helix that is turned like a right-handed screw stays so, and draws that are the same lie on it."""
+    angles = np.linspace(0, 8, 200)
+    helix = np.stack([np.cos(angles), np.sin(angles), 0.2 * angles], axis=1)
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    for one in (helix, helix[:, ::-1], helix @ turn):
+        axes = _best_axes(one)
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
+        assert np.linalg.det(axes) > 0
+        seen = (one - one.mean(axis=0)) @ axes
+        np.testing.assert_allclose(_moved_onto(one @ turn.T + 3, seen), seen, atol=1e-9)
+        assert (np.diff(seen.std(axis=0)) <= 0).all()

@@ -7,7 +7,7 @@ import {h} from './dom.js';
 import {Film} from './film.js';
 import {button, numeric, problem, remarks} from './parts.js';
 import {resultPanel} from './result.js';
-import {counted, duration, number, words} from './words.js';
+import {counted, duration, isComponent, number, words} from './words.js';
 
 const PLACE = 'calibration';
 const MUCH = 0.4; // share of the standard deviation that remains: below, the trial shows much of a parameter
@@ -171,6 +171,7 @@ export class CalibrationStep {
             {},
             `Best so far: difference ${number(best.score)}; `,
             Object.entries(best.parameters)
+              .filter(([name]) => !isComponent(name))
               .map(([name, value]) => `${words(name)} ${number(value)}`)
               .join(', '),
             ' (0 to 100)',

@@ -5,7 +5,7 @@
 
 import {h} from './dom.js';
 import {button, problem} from './parts.js';
-import {interval, measured, millimetres, number, words} from './words.js';
+import {interval, isComponent, measured, millimetres, number, words} from './words.js';
 
 const MARKS = {identifiable: 'good', 'weakly identifiable': 'weak', 'not identifiable': 'bad'};
 const FILES = {
@@ -45,7 +45,9 @@ export function resultPanel(step, calibration) {
         h(
           'tbody',
           {},
-          Object.entries(result.parameters).map(([name, one]) => parameter(name, one)),
+          Object.entries(result.parameters)
+            .filter(([name]) => !isComponent(name))
+            .map(([name, one]) => parameter(name, one)),
         ),
       ),
     ),

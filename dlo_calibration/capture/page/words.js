@@ -28,6 +28,11 @@ export function measured(value, unit) {
   return unit === '1' || !unit ? number(value) : `${number(value)} ${spelled(unit)}`;
 }
 
+/** @returns {boolean} whether a parameter is one of up to 18 components of a rest shape, which sentences tell */
+export function isComponent(name) {
+  return /^rest_curvature_[xy]\d$/.test(name);
+}
+
 /** @returns {string} both ends of an interval with one unit */
 export function interval(lower, upper, unit) {
   const [low, high] = unit === 'm' ? [1e3 * lower, 1e3 * upper] : [lower, upper];
