@@ -37,6 +37,7 @@ from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.simulation.protocol import Simulator
 
+MOST_SOUGHT = 6  # parameters for which an action is sought, so that many do not take long
 WORTH_IT = 0.8  # an action is advised if it reduces the standard deviation to less than this share
 
 
@@ -79,8 +80,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     Return the action that reduces the largest standard deviation most.
 
     If no action helps for the least certain parameter, the next one is tried, until all that are left
-    are identifiable.  To save rollouts, only that parameter is varied at first; for the three best
-    actions, all others are then varied, too.
+    are identifiable, or actions were simulated for `MOST_SOUGHT`.  To save rollouts, only that parameter is
+    varied at first; for the three best actions, all others are then varied, too.
 
     :param point: (d,) the found values in the unit cube.
     :param uncertainty: the present one.
@@ -97,9 +98,10 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
         except (SimulationError, InputError):
             return None  # this DLO does not allow the action
 
-    for k in np.argsort(-uncertainty.std, kind='stable'):
+    sought: set[int] = set()
+    for k in np.argsort(-uncertainty.std, kind='stable').tolist():
         now = float(uncertainty.std[k])
-        if now < IDENTIFIABLE_STD:
+        if now < IDENTIFIABLE_STD or len(sought) == MOST_SOUGHT:
             return None
         alone = np.arange(space.dimension) == k
         promising: list[tuple[float, Candidate, Floats]] = []
@@ -108,6 +110,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
                 return None
             if not excites([candidate.trial], space, np.inf)[0, k]:  # a table may be anywhere
                 continue
+            sought.add(k)
             matrix = simulated(candidate, alone)
             if matrix is None:
                 possible.remove(candidate)

@@ -13,6 +13,7 @@ import numpy as np
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.bending import natural_curvature
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.observation.table import HANGING, lying_level
@@ -159,10 +160,12 @@ def _remarks_on_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
     each, at = away.mean(axis=1), goal.arc_lengths() / goal.length
     if each.mean() > options.tolerance / 100 * goal.length / 2:
         worst = int(away.mean(axis=0).argmax())
+        curved = natural_curvature(posterior.best, at).any()
         yield (f'laid exactly on the goal and let go, the DLO springs back by {_mm(each.mean())} on average '
                f'({_percent(each.mean(), goal)} of the length; {_mm(each.min())} to {_mm(each.max())} within '
                f'the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at {at[worst]:.2f} '
-               'of the length: friction holds only bends with a radius above about '
+               f'of the length: friction holds only bends {"beyond its rest shape " * bool(curved)}with a '
+               'radius above about '
                f'{_mm(sharpest_bend(posterior.best, goal.length))}, and none at the ends')
 
 

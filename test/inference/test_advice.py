@@ -8,13 +8,14 @@ from dataclasses import replace
 from fitting import fitted
 import numpy as np
 import pytest
+from remembering import remembering_result
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Chain, Goal, SimulationError, Trial
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import advised
-from dlo_calibration.inference.advice import advise, candidates
+from dlo_calibration.inference.advice import advise, candidates, MOST_SOUGHT
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import SEARCHES
@@ -122,6 +123,15 @@ def test_few_rollouts_are_spent():
     count = len(list(candidates(result.trials)))
     # Both sides in friction for each, both in flexibility for the best three.
     assert len(simulator.names) <= 2 * count + 6
+
+
+def test_of_many_parameters_the_least_certain_are_sought():
+    """The toy shows four of thirty parameters, which are the most certain ones."""
+    result = remembering_result()
+    unsure = replace(result.examination.uncertainty, std=np.where(np.arange(30) < 4, 0.15, 0.2))
+    simulator = Telling('')
+    assert advise(result.trials, result.space, simulator, result.best.point, unsure, result.length) is None
+    assert len(simulator.names) <= 2 * MOST_SOUGHT * len(list(candidates(result.trials)))
 
 
 class Failing(Telling):
