@@ -76,8 +76,7 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
     """Yield each name, the space with its a parameters added, and k values (k, a) to try in the unit cube."""
     for parameter in PARAMETERS:
         name = parameter.name
-        absent = name in (*PART_NAMES, *REST_SHAPE) or name == 'mass' and not space.mass_known
-        if name in space.free or absent:
+        if name in space.free or name in (*PART_NAMES, *REST_SHAPE) or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE
@@ -88,6 +87,13 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
         divided = space.divided(4)  # four parts can show a middle that is stiffer than both ends
         even = np.array([BY_NAME[name].default for name in PART_NAMES[:3]]) / SCALE
         yield PARTS, divided, even + MOVE * np.eye(len(even))
+
+
+def _is_idle(name: str, space: ParameterSpace) -> bool:
+    """Tell whether a parameter has no effect of its own beside those that this DLO has."""
+    if name == 'bending_slip':
+        return 'bending_friction' not in space.free and not space.fixed.get('bending_friction', 0.0)
+    return name == 'mass' and not space.mass_known or name == 'natural_curvature' and space.knots > 0
 
 
 def _is_absent(parameter: Parameter, now: float) -> bool:

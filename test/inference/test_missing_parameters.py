@@ -13,7 +13,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import with_missing_parameters
-from dlo_calibration.inference.missing_parameters import PARTS
+from dlo_calibration.inference.missing_parameters import _candidates, PARTS
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.report.sentences import sentences
 from dlo_calibration.search import LeastSquares
@@ -26,7 +26,12 @@ def found(trials, space=EVEN):
     return with_missing_parameters(Setting(result.trials, Options(), simulator), result)
 
 
-@pytest.mark.parametrize('name, value', [('natural_curvature', 15.0), ('length_scale', 70.0)])
+def candidates(space):
+    return {name for name, *_ in _candidates(space)}
+
+
+@pytest.mark.parametrize('name, value', [
+    ('natural_curvature', 15.0), ('length_scale', 70.0), ('bending_friction', 45.0)])
 def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
     assert result.missing_parameters[0].name == name
@@ -57,6 +62,13 @@ def test_nothing_is_named_that_would_not_help():
     result = found(trials)
     assert result.examination.uncertainty.residual > 5e-3
     assert result.missing_parameters == ()
+
+
+def test_what_has_no_effect_of_its_own_is_not_simulated():
+    space = ParameterSpace(('flexibility',), {'bending_friction': 0.0})
+    assert 'bending_slip' not in candidates(space) and 'bending_friction' in candidates(space)
+    assert 'bending_slip' in candidates(ParameterSpace(('flexibility', 'bending_friction')))
+    assert 'natural_curvature' in candidates(space) - candidates(space.shaped(3))
 
 
 def test_a_stop_leaves_the_result_as_it_is():
