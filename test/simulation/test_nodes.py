@@ -196,3 +196,36 @@ def test_rest_lengths_of_the_trial_count_and_the_nodes_begin_on_the_observed_cur
     assert layout.observe @ layout.points == pytest.approx(arc(), abs=1e-3)
     marked = replace(one, initial=replace(one.initial, features=np.arange(21) == 20))
     assert NodeLayout.of(marked, 41).features[-1] == 1
+
+
+def clamped(noise, markers, seed=0):
+    """Return a trial of a bent DLO whose ends are clamped, with a stream of 30 goals; noise in m."""
+    random = np.random.default_rng(seed)
+    along = np.linspace(0, 1, markers)
+    swing = np.sin(np.arange(31) / 10)[:, None]
+    rise = 0.1 * np.sin(5 * along) + 0 * swing
+    points = np.stack([along + 0 * swing, rise, 0.1 * swing * along**2], axis=2)
+    points += random.normal(0, noise, points.shape)
+    hands = [Hand(name, grips, [0.0, 9.0], np.zeros((2, 3)))
+             for name, grips in (('left', (0, 1)), ('right', (markers - 2, markers - 1)))]
+    return Trial('clamped', Chain(points[0]), (Action(hands),),
+                 [Goal(Chain(one), k / 30, False, ('left', 'right')) for k, one in enumerate(points[1:], 1)])
+
+
+def test_clamps_that_a_stream_shows_are_held_where_they_were_measured():
+    one = clamped(3e-5, 12)
+    layout = NodeLayout.of(one, 41)
+    for hand in one.hands:
+        measured = one.initial.points[list(hand.grips)]
+        assert layout.points[list(layout.nodes(hand))] == pytest.approx(measured, abs=2e-5)
+
+
+def test_smoothing_makes_the_direction_of_a_noisy_clamp_truer():
+    exact = clamped(0.0, 41).initial.points
+    measured, used = [], []
+    for seed in range(20):
+        one = clamped(1e-3, 41, seed)
+        layout = NodeLayout.of(one, 61)
+        measured.append(one.initial.points[1] - one.initial.points[0] - exact[1] + exact[0])
+        used.append(layout.points[layout.nodes(one.hands[0])[1]] - layout.points[0] - exact[1] + exact[0])
+    assert np.linalg.norm(used) < 0.7 * np.linalg.norm(measured)
