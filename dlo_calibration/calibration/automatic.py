@@ -16,7 +16,7 @@ from dlo_calibration.observation.excitation import motions
 
 #: What `calibrate` auto adds to the paper's parameters.
 IN_MOTION = ('damping', 'internal_damping')
-BETWEEN_CLAMPS = ('torsion',)
+BETWEEN_CLAMPS = ('torsion', 'bending_friction', 'bending_slip')
 
 DECIDED = ('calibrate', 'evaluations')  # names of the options that may be open
 
