@@ -17,7 +17,7 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.model.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.score import PointErrors, TrialScore
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import advanced, Rollout, Simulator
 
@@ -93,7 +93,7 @@ class Evaluator:
                                      for score, rollout in zip(self._scores, rollouts, strict=True)),
             unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
                             if not all(rollout.settled)))
-        residual = np.concatenate([residuals(trial, rollout.chains)
-                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
+        residual = np.concatenate([score.residuals(rollout.chains)
+                                   for score, rollout in zip(self._scores, rollouts, strict=True)])
         kept = residual if self._rows is None else residual[self._rows]
         return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(kept))

@@ -91,7 +91,7 @@ def difference_vector(goal: Floats, current: Floats, reference: int,
 
 
 class TrialScore:
-    """The difference score of one trial; the terms of its goals are computed once."""
+    """The difference score and the residuals of one trial; the terms of its goals are computed once."""
 
     def __init__(self, trial: Trial) -> None:
         self._points = observed(trial)
@@ -111,6 +111,10 @@ class TrialScore:
         place = np.einsum('gi,gij->gj', self._features, np.abs(self._points - chains))
         difference = self._shape - self._extent(chains) + place
         return float(np.linalg.norm(difference, axis=1).mean()) * 100
+
+    def residuals(self, chains: Floats) -> Floats:
+        """Return simulated minus observed coordinates, (g * n * 3,) [m], goal by goal."""
+        return np.asarray(chains - self._points).ravel()
 
 
 def residuals(trial: Trial, chains: Floats) -> Floats:

@@ -165,18 +165,18 @@ class _Course:
             grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
         end = min(events, default=math.inf) - 2 * step
         arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
-        count, last = 0, first
+        longest = 5000 * step  # a longer path would take much memory
+        last = first
         for goal in self._goals(first):
-            too_long = goal.time - self._time > 5000 * step  # a longer path would take much memory
-            if goal.stable or goal.time > end or too_long or not all(
+            if goal.stable or goal.time > end or goal.time - self._time > longest or arrived and not all(
                     self._trial.holds(hand, goal) for hand in arrived):
                 break
-            count = max(0, math.ceil((goal.time - ROUNDING - self._time) / step))
             last += 1
-        if not count:
+        count = math.ceil((self._trial.goals[last - 1].time - ROUNDING - self._time) / step)
+        if last == first or count <= 0:
             return {}
-        path = np.concatenate([[self._last[0], self._stepper.points],
-                               np.empty((count, *self._stepper.points.shape))])
+        path = np.empty((count + 2, *self._last[0].shape))
+        path[:2] = self._last[0], self._stepper.points
         times = np.concatenate([[self._last[1]], self._time + step * np.arange(count + 1)])
         self._advance(count, path[2:])
         self._last = path[-2], float(times[-2])
