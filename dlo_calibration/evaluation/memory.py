@@ -17,7 +17,7 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.log import digest, Entry, EVALUATION, EvaluationLog, ROLLOUT
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
-from dlo_calibration.model.trial import Trial
+from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
 ERRORS = len(fields(PointErrors))
@@ -36,7 +36,7 @@ class Memory:
                  on_failure: Callable[[str], None] = lambda _: None) -> None:
         self._log, self._engine, self._on_failure = log, engine, on_failure
         self._full = False
-        self._digests: dict[int, tuple[Trial, str]] = {}
+        self._digests: dict[int, tuple[Trial | Goal, str]] = {}
 
     def of(self, evaluator: Evaluator, finer: bool = False) -> EvaluatorMemory:
         """
@@ -54,11 +54,16 @@ class Memory:
         return simulator if self._log is None else _RememberingSimulator(self, self._engine, simulator)
 
     def digest(self, trial: Trial) -> str:
-        """Return the digest of a trial, which is made once: a trial may have hundreds of goals."""
-        known = self._digests.get(id(trial))
-        if known is None:  # with the trial, so that no other one gets its id
-            known = self._digests[id(trial)] = trial, digest(trial)
-        return known[1]
+        """Return the digest of a trial, which is made once: it may share hundreds of goals with others."""
+        if id(trial) not in self._digests:
+            others = {one.name: getattr(trial, one.name) for one in fields(trial) if one.name != 'goals'}
+            self._digests[id(trial)] = trial, digest(others, [self._goal(goal) for goal in trial.goals])
+        return self._digests[id(trial)][1]
+
+    def _goal(self, goal: Goal) -> str:
+        if id(goal) not in self._digests:
+            self._digests[id(goal)] = goal, digest(goal)  # with the goal, so that no other one gets its id
+        return self._digests[id(goal)][1]
 
     def find(self, key: str) -> Entry | None:
         """Return the entry with a key; None if there is none."""
