@@ -37,12 +37,21 @@ class Motions:
 
 def motions(trials: Sequence[Trial]) -> Motions:
     """Return what the timed goals of trials show; a goal while hands and DLO wait shows no motion."""
-    timed = [(trial, [goal for goal in trial.goals if not goal.stable]) for trial in trials]
-    moving = [(trial, goal) for trial, goals in timed
-              for goal, moves in zip(goals, _moves(trial, goals), strict=True) if moves]
+    moving: list[tuple[Trial, Goal]] = []
+    for trial in trials:
+        goals = [goal for goal in trial.goals if not goal.stable]
+        found = [(trial, goal) for goal, moves in zip(goals, _moves(trial, goals), strict=True) if moves]
+        if any(map(_clamped, found)):
+            return Motions(True, True)
+        moving += found
     moving = moving or _swinging(trials)
-    return Motions(bool(moving), any(
-        sum(len(hand.grips) > 1 for hand in trial.holding(goal)) > 1 for trial, goal in moving))
+    return Motions(bool(moving), any(map(_clamped, moving)))
+
+
+def _clamped(seen: tuple[Trial, Goal]) -> bool:
+    """Tell whether two hands or more clamp the DLO of a trial in a goal."""
+    trial, goal = seen
+    return sum(len(hand.grips) > 1 for hand in trial.holding(goal)) > 1
 
 
 def _moves(trial: Trial, goals: Sequence[Goal]) -> NDArray[np.bool_]:
