@@ -20,7 +20,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 
 #: Timed goals of one trial whose residuals search and examination compare; see doc/physics.md, A trial.
-MOST_TIMED = 25
+MOST_TIMED = 50
 
 
 def compared_goals(trial: Trial) -> list[int]:

@@ -71,7 +71,7 @@ def test_of_a_stream_a_few_goals_evenly_spread_over_time_are_compared():
     assert len(goals) == MOST_TIMED + 2
     assert goals[0] == 0
     assert goals[-3:] == [199, 200, 201]  # the last in motion, and both at rest
-    assert set(np.diff(goals[:-2])) == {8, 9}
+    assert set(np.diff(goals[:-2])) == {4, 5}
     # Twice as many frames in the second half: time counts, not their number.
     uneven = moving(trial, [*np.arange(100) / 10, *np.arange(10, 20, 0.05)])
     compared = np.array([uneven.goals[k].time for k in compared_goals(uneven)])
