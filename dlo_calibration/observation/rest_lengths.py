@@ -12,9 +12,9 @@ import numpy as np
 
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.noise import NO_NOISE, noise, smooth, STREAM
+from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
-VIEWS = 25  # goals of each trial that are measured, evenly spread: more would hardly change the mean
+VIEWS = 25  # goals of each trial that are measured, evenly spread; fewer do not outweigh one straight chain
 AGREES = 3.0  # standard deviations within a trial; segments of other points differ by more
 
 
@@ -30,7 +30,7 @@ def with_shared_places(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     as hands grip anew. Trials without such a stream, or with rest arc lengths, stay as they are.
     """
     measured = {k: _segments(trial) for k, trial in enumerate(trials)
-                if trial.places is None and sum(not goal.stable for goal in trial.goals) >= STREAM}
+                if trial.places is None and sum(not goal.stable for goal in trial.goals) >= VIEWS}
     found = list(trials)
     for count in {len(segments[0]) for segments in measured.values()}:
         same = {k: segments for k, segments in measured.items() if len(segments[0]) == count}
@@ -50,7 +50,7 @@ def _segments(trial: Trial) -> Floats:
     """Return the lengths of the segments, (v, n - 1) [m], in v timed goals, without the effect of noise."""
     seen = [goal.chain for goal in trial.goals if not goal.stable]
     sigma = noise([trial])
-    chains = [seen[k] for k in np.linspace(0, len(seen) - 1, min(len(seen), VIEWS)).astype(int)]
+    chains = [seen[k] for k in np.linspace(0, len(seen) - 1, VIEWS).astype(int)]
     if sigma > NO_NOISE:
         chains = [Chain(smooth(chain.points, sigma)) for chain in chains]
     return np.array([np.diff(chain.arc_lengths()) for chain in chains])

@@ -80,7 +80,7 @@ def test_trials_whose_points_lie_elsewhere_share_nothing():
 def test_photographs_share_nothing():
     # Whoever clicks points evenly gets the same number of points and similar lengths, but other points.
     still = [waving(seed, stable=True) for seed in range(3)]
-    few = [replace(waving(seed), goals=waving(seed).goals[:5]) for seed in range(3)]
+    few = [replace(waving(seed), goals=waving(seed).goals[:VIEWS - 1]) for seed in range(3)]
     assert all(trial.places is None for trial in with_shared_places([*still, *few]))
 
 
