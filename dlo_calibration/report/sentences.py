@@ -103,7 +103,8 @@ def _missing_parameters(result: CalibrationResult) -> list[str]:
     if not shares:
         return []
     names = [one.name for one in result.missing_parameters if one.name != PARTS]
-    how = [f'name {" or ".join(names)} in calibrate, beside {", ".join(result.space.free)}'] * bool(names)
+    beside = ', '.join(name for name in result.space.free if name not in knot_names(result.space.knots))
+    how = [f'name {" or ".join(names)} in calibrate, beside {beside}'] * bool(names)
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
     return [f'Parameters that were held fixed would explain these shares of the squared residuals: '
             f'{", ".join(shares)}. To calibrate them, too, {"; or ".join(how)}.']

@@ -23,6 +23,7 @@ from dlo_calibration.calibration.plain import plain
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.result import description_document, read_description
+from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.slices import MOST_LINES, simulate_slices
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.messages.codec import bag_types
@@ -105,6 +106,9 @@ def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
     assert '2.01 1/m (a radius of 497 mm)' in kept and 'more than 0.299 1/m' in kept
     assert not any(text.startswith('rest_curvature') for text in told)
     assert len(told) < 25
+    missing = replace(result, missing_parameters=(MissingParameter('marker_mass', 0.3),))
+    assert 'name marker_mass in calibrate, beside flexibility' in sentences(missing)[-1]
+    assert 'rest_curvature' not in sentences(missing)[-1]
 
 
 def test_what_is_not_known_is_not_claimed(result):
