@@ -63,7 +63,8 @@ class Options(DeclaredOptions):
     calibrate: tuple[str, ...] = declared(
         (AUTO,), "names of the parameters to find; all others keep their fixed value; auto: the paper's four "
         '(flexibility, elasticity, friction, self_collision), and what the trials show besides: damping and '
-        'internal_damping if goals were seen in motion, torsion if that was between two clamps',
+        'internal_damping if goals were seen in motion; torsion, bending_friction and bending_slip if that '
+        'was between two clamps',
         choices=(AUTO, *BY_NAME), of=SEARCH)
     parts: int = declared(
         1, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '

@@ -394,6 +394,6 @@ def test_what_it_cannot_use_is_told_in_one_sentence(tmp_path, capsys):
         refusal = refusal_of(capsys, *words)
         assert str(tmp_path / 'file') in refusal
         assert refusal.endswith(('name another folder', 'name another file'))
-    assert 'evaluations' in refusal_of(capsys, tmp_path / 'one', '--evaluations', 0)
+    assert 'evaluations' in refusal_of(capsys, tmp_path / 'one', '--evaluations', -1)
     with served(tmp_path / 'two'):
         assert 'another capture' in refusal_of(capsys, tmp_path / 'two')
