@@ -15,6 +15,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.planning.dlo import Posterior
+from dlo_calibration.report.bending_sentences import keeps_bends
 from dlo_calibration.report.figure import BAND, BLUE, FAINT, OBSERVED, Panel, panel, SIMULATED
 
 if TYPE_CHECKING:
@@ -50,11 +51,11 @@ def rest_shape_panels(result: CalibrationResult) -> list[Panel]:
 
 
 def moment_panels(result: CalibrationResult) -> list[Panel]:
-    """Draw the moment while a piece of the DLO is bent to and fro; nothing if there is no such friction."""
-    physical, space = result.physical(), result.space
-    friction, slip = physical.get('bending_friction', 0.0), physical.get('bending_slip', 1.0)
-    if not friction > 0:
+    """Draw the moment while a piece of the DLO is bent to and fro; nothing if no friction is known."""
+    if not keeps_bends(result):
         return []
+    physical, space = result.physical(), result.space
+    friction, slip = physical['bending_friction'], physical['bending_slip']
     flexibility = result.values.get(
         'flexibility', space.fixed.get('flexibility', BY_NAME['flexibility'].default))
     stiffness, unit = space.reported('flexibility', flexibility)

@@ -45,12 +45,24 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
 
 def friction_sentences(result: CalibrationResult) -> list[str]:
     """Say how much of a bend the DLO keeps; nothing if it keeps none, or if that is not known."""
-    physical, found = result.physical(), result.parameters.get('bending_friction')
-    if not physical.get('bending_friction', 0) > 0 or found and found.verdict == NOT_IDENTIFIABLE:
+    if not keeps_bends(result):
         return []
-    return [f'Bent far and released, the DLO keeps a curvature of up to '
-            f'{_with_radius(physical["bending_friction"])}, because its strands rub on each other; they slip '
-            f'where the curvature changes by more than {measured(physical["bending_slip"], "1/m")}.']
+    physical, unsure = result.physical(), _verdict(result, 'bending_friction') == WEAK
+    slips = '' if _verdict(result, 'bending_slip') == NOT_IDENTIFIABLE else (
+        f'; they slip where the curvature changes by more than {measured(physical["bending_slip"], "1/m")}')
+    return [f'Bent far and released, the DLO {"may keep" if unsure else "keeps"} a curvature of up to '
+            f'{_with_radius(physical["bending_friction"])}, because its strands rub on each other{slips}.']
+
+
+def keeps_bends(result: CalibrationResult) -> bool:
+    """Tell whether it is known that there is friction between the strands."""
+    return result.physical().get('bending_friction', 0.0) > 0 and \
+        _verdict(result, 'bending_friction') != NOT_IDENTIFIABLE
+
+
+def _verdict(result: CalibrationResult, name: str) -> str:
+    """Return the verdict on a found parameter; empty for others."""
+    return result.parameters[name].verdict if name in result.parameters else ''
 
 
 def _with_radius(curvature: float) -> str:

@@ -25,7 +25,7 @@ from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.result import description_document, read_description
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.slices import MOST_LINES, simulate_slices
-from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
+from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import knot_names
 from dlo_calibration.planning.dlo import Posterior
@@ -111,10 +111,17 @@ def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
     assert 'rest_curvature' not in sentences(missing)[-1]
 
 
-def test_what_is_not_known_is_not_claimed(result):
-    friction = replace(result.parameters['bending_friction'], verdict=NOT_IDENTIFIABLE, identifiable=False)
-    changed = replace(result, parameters={**result.parameters, 'bending_friction': friction})
-    assert not any(text.startswith('Bent far') for text in sentences(changed))
+def test_what_is_not_known_is_not_claimed(result, without_drawings):
+    def kept(**verdicts):
+        changed = {name: replace(result.parameters[name], verdict=verdict)
+                   for name, verdict in verdicts.items()}
+        found = replace(result, parameters={**result.parameters, **changed})
+        return ''.join(text for text in sentences(found) if text.startswith('Bent far')), moment_panels(found)
+
+    assert kept(bending_friction=NOT_IDENTIFIABLE) == ('', [])
+    assert ' may keep a curvature ' in kept(bending_friction=WEAK)[0]
+    words, drawn = kept(bending_friction=IDENTIFIABLE, bending_slip=NOT_IDENTIFIABLE)
+    assert ' keeps a curvature ' in words and 'slip' not in words and drawn
 
 
 def test_draws_are_whole_ropes_within_the_scale(result):
