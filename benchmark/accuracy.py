@@ -29,9 +29,7 @@ COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,1,2,3,4,5,6,7'
 MOCAP_OTHER = '42,43,44,45,46,47,48,49,50,51,52,53,54,55'
 MOCAP_PARAMETERS = 'flexibility,damping,internal_damping,torsion'
-HANGING_PARAMETERS = 'flexibility,length_scale'
-MANY_EVALUATIONS = '400'  # of cables and wires, in as many parts as their trials support
-HANGING_NODES = '121'  # the bend at a clamp is a few centimetres long, see elastica.py
+MANY_EVALUATIONS = '400'  # of cables, in as many parts as their trials support
 WIRE = 1.5  # m
 
 
@@ -107,29 +105,23 @@ def mocap(folder: Path, options: list[str]) -> str:
 def hanging(folder: Path, options: list[str]) -> str:
     """Tabulate two wires: fitted on four repeats, judged on the fifth; and EI fitted on each repeat alone."""
     sections = []
-    arguments = ['--calibrate', HANGING_PARAMETERS, '--nodes', HANGING_NODES, *options,
-                 '--evaluations', MANY_EVALUATIONS]
     for wire in ('white', 'black'):
         session = convert('hanging', wire, folder / wire, '--repeats', '0,1,2,3')
         last = convert('hanging', wire, folder / f'{wire}_other', '--repeats', '4')
-        tables, percents = [], []
-        for parts in ('1', '0'):
-            fitted = fit(session, folder / f'{wire}_fit_{parts}', *arguments, '--parts', parts)
-            other = validate(folder / f'{wire}_fit_{parts}', last)
-            tables.append(table('repeats', fitted, other))
-            percents.append([100 * one['rms_error_m'] / WIRE for one in (fitted, other)])
+        fitted = fit(session, folder / f'{wire}_fit', *options)
+        other = validate(folder / f'{wire}_fit', last)
+        percents = [100 * one['rms_error_m'] / WIRE for one in (fitted, other)]
         stiffness = []
         for repeat in '01234':
             session = convert('hanging', wire, folder / f'{wire}_{repeat}', '--repeats', repeat)
-            one = fit(session, folder / f'{wire}_{repeat}_fit', *arguments)
+            one = fit(session, folder / f'{wire}_{repeat}_fit', *options)
             stiffness.append(one['parameters']['flexibility']['physical_value'])
         spread = 100 * float(np.std(stiffness) / np.mean(stiffness))
         sections.append(
-            f'## {wire}\n\nAn even wire:\n\n{tables[0]}\n\n'
-            f'In as many parts as the repeats support:\n\n{tables[1]}\n\n'
-            f'Root mean square in percent of the length, fitted and predicted: {percents[0][0]:.2f} and '
-            f'{percents[0][1]:.2f} as an even wire, {percents[1][0]:.2f} and {percents[1][1]:.2f} in parts. '
-            'EI of each repeat by itself: ' + ', '.join(f'{value:.3g}' for value in stiffness)
+            f'## {wire}\n\n{table("repeats", fitted, other)}\n\n'
+            f'Root mean square in percent of the length, fitted and predicted: {percents[0]:.2f} and '
+            f'{percents[1]:.2f}. EI of each repeat by itself: '
+            + ', '.join(f'{value:.3g}' for value in stiffness)
             + f' N m^2, standard deviation {spread:.0f} %.')
     return '\n\n'.join(sections)
 
