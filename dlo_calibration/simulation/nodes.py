@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, interpolation_matrix
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.clamps import clamp_directions
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
 
@@ -95,40 +95,6 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
     np.add.at(shares, after - 1, 1 - share)
     np.add.at(shares, after, share)
     return shares
-
-
-def clamp_directions(points: Floats, holding: Sequence[tuple[Sequence[int], Hand]]) -> Floats:
-    """
-    Return unit vectors across the segments in clamps, (N - 1, 3), fixed to the hands; nan elsewhere.
-
-    A DLO that stays in its clamps from trial to trial lies in the hand's frame always the same, so that
-    any direction across it would do.  Where the orientations of hands are relative to the start of
-    each trial, it does not.  So the direction is the x axis of the hand, turned by the smallest rotation from
-    its -z axis to the DLO that leaves the clamp, or from its +z axis if that is nearer than 30 degrees.
-
-    :param points: (N, 3) [m] nodes at the start.
-    :param holding: the hands and the nodes that each of them holds.
-    """
-    directions = np.full((len(points) - 1, 3), np.nan)
-    for nodes, hand in holding:
-        turn = _matrix(hand.orientations[0])
-        held = sorted(nodes)
-        for segment in (a for a, b in zip(held[:-1], held[1:], strict=True) if b == a + 1):
-            along = points[segment + 1] - points[segment]
-            leaves = along if held[-1] < len(points) - 1 else -along
-            there = turn.T @ (leaves / np.linalg.norm(leaves))
-            axis = np.array([0.0, 0.0, 1.0 if there[2] > np.cos(np.pi / 6) else -1.0])
-            across = np.array([1.0, 0.0, 0.0]) - there[0] / (1 + axis @ there) * (axis + there)
-            directions[segment] = turn @ across
-    return directions
-
-
-def _matrix(quaternion: Floats) -> Floats:
-    """Return the (3, 3) rotation matrix of a unit quaternion x y z w."""
-    x, y, z, w = quaternion
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
 
 
 def _without_noise(trial: Trial) -> Chain:
