@@ -229,15 +229,15 @@ class ParameterSpace:
 
     def with_knots(self, knots: int, point: Sequence[float] | Floats
                    ) -> tuple[ParameterSpace, NDArray[np.float64]]:
-        """Return the space with more knots, all free, and its point for the DLO at the (d,) `point`."""
+        """Return the space with other knots, all free, and its point for the DLO at the (d,) `point`."""
         values, now = {**self.fixed, **self.values(point)}, self.knots
         space = replace(self, fixed={name: value for name, value in self.fixed.items()
                                      if name not in REST_SHAPE}).shaped(knots)
         for axis in 'xy' if now else '':
-            names = [f'rest_curvature_{axis}{knot}' for knot in range(1, knots + 1)]
+            names = [f'rest_curvature_{axis}{knot}' for knot in range(1, max(knots, now) + 1)]
             known = [values.get(name, BY_NAME[name].default) for name in names[:now]]
             between = np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, now), known)
-            values.update(zip(names, between.tolist(), strict=True))
+            values.update(zip(names[:knots], between.tolist(), strict=True))
         return space, space.point({name: values.get(name, BY_NAME[name].default) for name in space.free})
 
     @property

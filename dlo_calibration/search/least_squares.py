@@ -11,7 +11,7 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import both_sides, inward, slope, STEP
+from dlo_calibration.evaluation.linearisation import both_sides, inward, Linearisation, slope, STEP
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, NEAR
@@ -23,6 +23,7 @@ FIRST_STEP = 0.015  # of a finite difference; larger steps mislead beside a narr
 SHORTER = 1 / 4  # radius of the second step that is tried, relative to the first
 DONE_STEP = 1e-3  # converged where the next step changes every parameter by no more than this
 DONE_GAIN = 1e-4  # or is predicted to lower the cost by no more than this share
+COARSE_GAIN = 0.01  # the same for a coarse search: cross-validation would not notice less
 SCAN_RADIUS = 0.1  # of a step from a scanned point; points nearer than this to the minimum are not scanned
 MOST_ITERATIONS = 25  # of one descent
 
@@ -58,11 +59,23 @@ class LeastSquares(PlannedSearch):
         # one measured is kept: contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)
         self._lowest: Observation | None = None
+        self._descents: list[Descent] = []
 
     @property
     def best(self) -> Floats | None:
         """The (d,) point of lowest robust cost; its difference score may not be the lowest."""
         return None if self._lowest is None else self._lowest.point
+
+    @property
+    def model(self) -> Linearisation | None:
+        """Linear model of the residuals at `best`; None where no descent came near it."""
+        lowest = self._lowest
+        if lowest is None or lowest.residuals is None:
+            return None
+        near = [(float(np.abs(one.point - lowest.point).max()), one.jacobian)
+                for one in self._descents if one.origin is not None]
+        distance, jacobian = min(near, key=lambda pair: pair[0], default=(np.inf, np.zeros(0)))
+        return Linearisation(lowest.point, lowest.residuals, jacobian) if distance <= NEAR else None
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Take the results of the last `ask`."""
@@ -108,7 +121,9 @@ class LeastSquares(PlannedSearch):
                     best, found = descent, 1
             if not best.ended:
                 best = yield from self._descend(best, None, ())
-        best = yield from self._polish(best)
+        if self._hints.jacobian is None:
+            best = yield from self._polish(best)
+            self._descents.append(best)
         return best.ended + (f'; reached from {found} starts' if found > 1 else '')
 
     def _polish(self, here: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
@@ -142,8 +157,13 @@ class LeastSquares(PlannedSearch):
 
     def _begin(self, start: Observation) -> Descent:
         assert start.residuals is not None
-        return Descent(start.point, start.residuals, Huber.of(start.residuals),
-                       np.zeros((len(start.residuals), self._dimension)))
+        begun = Descent(start.point, start.residuals, Huber.of(start.residuals),
+                        np.zeros((len(start.residuals), self._dimension)))
+        if self._hints.jacobian is not None and np.array_equal(start.point, np.clip(self._hints.start, 0, 1)):
+            begun.jacobian, begun.moves = self._hints.jacobian, 1
+            begun.origin = np.full(self._dimension, np.inf)  # not fresh, as it is not quite that of here
+            self._see_effects(begun)
+        return begun
 
     def _look_beyond(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
         """
@@ -221,6 +241,7 @@ class LeastSquares(PlannedSearch):
         It is given up where it leads to the `known` minimum or to a higher one, or where it is
         slow and one of the start points `rivals` is as promising.
         """
+        self._descents = [one for one in self._descents if one is not here] + [here]
         slow = 0
         if here.origin is None:
             yield from self._measure(here, np.flatnonzero(self._hints.excited))
@@ -231,7 +252,8 @@ class LeastSquares(PlannedSearch):
             if known is not None and self._leads_nowhere(here, step, known):
                 return here
             # Where the residuals are rough, a gain below a tenth of their relative roughness is chance.
-            least = max(DONE_GAIN, 0.1 * min(here.roughness / here.loss.threshold, 0.03))
+            least = max(COARSE_GAIN if self._hints.coarse else DONE_GAIN,
+                        0.1 * min(here.roughness / here.loss.threshold, 0.03))
             if length <= DONE_STEP or gain <= least * here.cost:
                 if here.jacobian_is_fresh:
                     here.ended = (
@@ -304,11 +326,14 @@ class LeastSquares(PlannedSearch):
         here.jacobian = here.jacobian.copy()
         sizes = self._difference_steps(here)
         seen = yield from self._differences(here, columns, sizes)
-        effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
-        self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
+        self._see_effects(here)
         nearest = min(seen, key=lambda one: here.loss.cost(one.residuals), default=None)
         if nearest is not None and here.loss.cost(nearest.residuals) < here.cost:
             here.move(nearest)
+
+    def _see_effects(self, here: Descent) -> None:
+        effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
+        self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
 
     def _differences(self, here: Descent, columns: NDArray[np.intp], sizes: Floats
                      ) -> Generator[Floats, Sequence[Observation], list[Observation]]:
@@ -329,7 +354,7 @@ class LeastSquares(PlannedSearch):
 
     def _difference_steps(self, here: Descent) -> Floats:
         """Return (d,) steps of finite differences that change the residuals well beyond their roughness."""
-        if not here.jacobian.any():
+        if not here.jacobian.any() or self._hints.jacobian is not None:
             return np.full(self._dimension, FIRST_STEP)
         most = here.loss.threshold
         change = min(max(0.2 * most, 10 * here.roughness), most)  # [m] of the residuals by one difference

@@ -9,6 +9,7 @@ from typing import Generator, Sequence
 
 import numpy as np
 
+from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Observation
 
@@ -53,6 +54,11 @@ class PlannedSearch:
             self._batch = np.asarray(self._plan_under_way.send(told), dtype=float)
         except StopIteration as end:
             self._batch, self._reason = np.zeros((0, self._dimension)), str(end.value)
+
+    @property
+    def model(self) -> Linearisation | None:
+        """None: the method makes no linear model."""
+        return None
 
     @property
     def stop_reason(self) -> str:

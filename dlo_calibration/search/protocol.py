@@ -11,6 +11,7 @@ from typing import Protocol, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.model.chain import Floats, frozen_array
 
 
@@ -38,11 +39,15 @@ class Hints:
     :param start: (d,) prior estimate; nan where there is none.
     :param excited: (d,) False where no trial can show the effect of a parameter.
     :param refines: `start` is the result for a simpler model, so that the search starts only there.
+    :param jacobian: (m, d) of the residuals at `start` [m per unit cube], if it is known already.
+    :param coarse: another search will refine the result, so that this one ends where steps gain little.
     """
 
     start: Floats
     excited: NDArray[np.bool_]
     refines: bool = False
+    jacobian: Floats | None = None
+    coarse: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'start', frozen_array(self.start))
@@ -54,9 +59,9 @@ class Hints:
         return cls(np.full(dimension, np.nan), np.ones(dimension, np.bool_))
 
     @classmethod
-    def at(cls, start: Floats) -> Hints:
+    def at(cls, start: Floats, jacobian: Floats | None = None, coarse: bool = False) -> Hints:
         """Return hints with the result (d,) of a search with a simpler model as the only start."""
-        return cls(start, np.ones(len(start), np.bool_), refines=True)
+        return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse)
 
 
 class Search(Protocol):
@@ -82,3 +87,7 @@ class Search(Protocol):
     @property
     def best(self) -> Floats | None:
         """The (d,) point that is the result of the method; None until an evaluation has succeeded."""
+
+    @property
+    def model(self) -> Linearisation | None:
+        """Linear model of the residuals at `best`; None where the method has not made one."""

@@ -9,6 +9,7 @@ from typing import Sequence
 
 import numpy as np
 
+from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
@@ -38,6 +39,11 @@ class RandomSearch:
         for one in observations:
             if np.isfinite(one.score) and (self._lowest is None or one.score < self._lowest.score):
                 self._lowest = one
+
+    @property
+    def model(self) -> Linearisation | None:
+        """None: random points make no linear model."""
+        return None
 
     @property
     def stop_reason(self) -> str:

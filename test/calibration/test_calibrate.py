@@ -214,7 +214,7 @@ def test_a_search_that_finishes_early_says_why():
     class Finished:
         name = 'finished'
         limit = float('inf')
-        best = None
+        best = model = None
         stop_reason = 'it cannot get better'
 
         def __init__(self):
