@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
 from typing import Sequence
 
 from dlo_calibration.calibration.options import AUTO, Options
@@ -22,7 +21,7 @@ DECIDED = ('calibrate', 'evaluations')  # names of the options that may be open
 
 PAPER_ROUNDS = 150  # evaluations; enough for the paper's four parameters
 LINEARISATIONS = 15  # that a search can make with its budget: a Gauss-Newton descent takes about 10
-UNIFORM_SHARE = 0.4  # of the budget, for the uniform DLO, where the number of parts is open
+REFINEMENT = 400  # evaluations for rest shape and parts, where these are open, beside those of one search
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ def choose(trials: Sequence[Trial], options: Options) -> Choice:
 
 
 def chooses_parts(trials: Sequence[Trial], options: Options) -> bool:
-    """Tell whether cross-validation over the trials chooses the number of parts."""
+    """Tell whether cross-validation over the trials chooses rest shape and number of parts."""
     return options.parts == 0 and len(trials) > 1 and 'flexibility' in options.space.free
 
 
@@ -65,7 +64,7 @@ def budget(dimension: int) -> int:
 
 def _evaluations(trials: Sequence[Trial], options: Options) -> int:
     least = budget(options.space.dimension)
-    return math.ceil(least / UNIFORM_SHARE) if chooses_parts(trials, options) else least
+    return least + REFINEMENT if chooses_parts(trials, options) else least
 
 
 def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:

@@ -8,18 +8,17 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import closing, ExitStack
 from dataclasses import replace
-import math
 import time
 from typing import Callable, Sequence
 
-from dlo_calibration.calibration.automatic import choose, UNIFORM_SHARE
+from dlo_calibration.calibration.automatic import budget, choose
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.identity import engine_digest
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.parts import fit_parts
 from dlo_calibration.calibration.prior import Prior, prior
+from dlo_calibration.calibration.refinement import refine
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import advised, confirmed, confirming, with_missing_parameters
@@ -112,9 +111,8 @@ def searched(setting: Setting, known: Prior) -> Fit:
     search = SEARCHES[options.search](known.space.dimension, options.seed, known.hints)
     if not setting.chooses_parts:
         return fit(setting, known.space, search, options.evaluations)
-    # The uniform DLO gets a share of the budget, so that enough is left for several parts.
-    uniform = fit(setting, known.space, search, max(1, math.ceil(UNIFORM_SHARE * options.evaluations)))
-    return fit_parts(setting, uniform, options.evaluations)
+    uniform = fit(setting, known.space, search, min(options.evaluations, budget(known.space.dimension)))
+    return refine(setting, uniform, options.evaluations)
 
 
 def _executor(options: Options, on_death: Callable[[str], None],

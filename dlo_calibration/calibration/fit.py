@@ -12,6 +12,7 @@ import numpy as np
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
+from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.search import Observation, Search
@@ -29,7 +30,9 @@ class Fit:
     :param ended: why the search ended, in words.
     :param stopped: whether the user stopped it.
     :param examination: of the surroundings of the best evaluation; None if the user stopped before.
-    :param parts: how the number of parts was chosen, in words; empty if it was given.
+    :param parts: how the numbers of parts and knots were chosen, in words; empty if they were given.
+    :param model: linear model of the residuals at the best evaluation; None if the search made none.
+    :param validated: number of parameter sets simulated to choose the numbers of parts and knots.
     """
 
     space: ParameterSpace
@@ -40,6 +43,8 @@ class Fit:
     stopped: bool = False
     examination: Examination | None = None
     parts: str = ''
+    model: Linearisation | None = None
+    validated: int = 0
 
     @property
     def stop_reason(self) -> str:
@@ -48,8 +53,8 @@ class Fit:
 
     @property
     def examined(self) -> int:
-        """Number of parameter sets simulated for the examination; 0 without one."""
-        return 0 if self.examination is None else self.examination.evaluations
+        """Number of parameter sets simulated beside the search."""
+        return self.validated + (0 if self.examination is None else self.examination.evaluations)
 
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
@@ -83,8 +88,8 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
         raise SimulationError('stopped before the first evaluation had finished')
     if not best.scores:
         raise SimulationError(f'none of {len(kept)} evaluations could be simulated: {best.failure}')
-    ended = search.stop_reason or f'budget of {budget} evaluations spent'
-    return Fit(space, search.name, best, tuple(kept), ended, stopped)
+    ended = search.stop_reason or f'budget of {first + budget} evaluations spent'
+    return Fit(space, search.name, best, tuple(kept), ended, stopped, model=search.model)
 
 
 def _better(best: Evaluation | None, batch: list[Evaluation], search: Search) -> Evaluation | None:

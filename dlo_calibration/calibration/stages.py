@@ -55,7 +55,7 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
         return replace(result, missing_parameters=missing_parameters(
             Evaluator(result.trials, result.space, setting.own_simulator, every_goal=False),
             Linearisation(best.point, best.residuals if rows is None else best.residuals[rows],
-                          found.jacobian), setting.should_stop))
+                          found.jacobian), setting.should_stop, parts=not setting.chooses_parts))
     except CancelledError:
         return result
 

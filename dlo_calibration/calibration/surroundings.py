@@ -41,7 +41,8 @@ def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
         return replace(fit, examination=None, stopped=True)
     count = examination.evaluations + fit.examined
     band = frozen_array(at_every_goal(examination.band, setting.trials))
-    return replace(fit, best=best, examination=replace(examination, evaluations=count, band=band))
+    return replace(fit, best=best, validated=0,
+                   examination=replace(examination, evaluations=count, band=band))
 
 
 def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, Evaluation]:

@@ -43,7 +43,8 @@ class MissingParameter:
 
 
 def missing_parameters(evaluator: Evaluator, fit: Linearisation,
-                       should_stop: Callable[[], bool] = lambda: False) -> tuple[MissingParameter, ...]:
+                       should_stop: Callable[[], bool] = lambda: False, parts: bool = True
+                       ) -> tuple[MissingParameter, ...]:
     """
     Return the parameters that would explain at least a tenth of the squared residuals, largest share first.
 
@@ -53,13 +54,14 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
 
     :param evaluator: of the calibration; it compares the goals that `fit` does.
     :param fit: the residuals at the found parameters, linearised.
+    :param parts: False: the calibration has tried parts of different stiffness.
     :raises CancelledError: when stopped.
     """
     roots = Huber.of(fit.residuals).roots(fit.residuals)
     weighted = fit.weighted(roots)
     left = perpendicular(weighted.jacobian, weighted.residuals)
     found = []
-    for name, wider, moves in _candidates(evaluator.space):
+    for name, wider, moves in _candidates(evaluator.space, parts):
         wide = evaluator.of(wider)
         columns = []
         for move in moves:
@@ -72,7 +74,7 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
     return tuple(sorted(found, key=lambda one: -one.share))
 
 
-def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Floats]]:
+def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str, ParameterSpace, Floats]]:
     """Yield each name, the space with its a parameters added, and k values (k, a) to try in the unit cube."""
     for parameter in PARAMETERS:
         name = parameter.name
@@ -83,7 +85,7 @@ def _candidates(space: ParameterSpace) -> Iterator[tuple[str, ParameterSpace, Fl
         step = 0.5 if _is_absent(parameter, now) else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
                np.array([[now + step if now + step <= 1 else now - step]]))
-    if space.parts == 1 and 'flexibility' in space.free:
+    if parts and space.parts == 1 and 'flexibility' in space.free:
         divided = space.divided(4)  # four parts can show a middle that is stiffer than both ends
         even = np.array([BY_NAME[name].default for name in PART_NAMES[:3]]) / SCALE
         yield PARTS, divided, even + MOVE * np.eye(len(even))

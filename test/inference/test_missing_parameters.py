@@ -23,7 +23,7 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 def found(trials, space=EVEN):
     simulator = CompiledSimulator(table=False, nodes=21)
     result = fitted(trials, space, simulator, LeastSquares(space.dimension, 1), budget=40)
-    return with_missing_parameters(Setting(result.trials, Options(), simulator), result)
+    return with_missing_parameters(Setting(result.trials, Options(parts=1), simulator), result)
 
 
 def candidates(space):
