@@ -41,6 +41,7 @@ ROUNDED = 0.05  # rad; mean bend below which the energy of natural curvature is 
 STEADY = 0.01  # rad; where the bends are smaller than this, natural curvature turns the frame slowly
 REACH = 0.2  # rad; most that the material frame turns in a step
 FIRST_TURNS = 30  # iterations for the angles at the start; later, one in each step does
+AHEAD = 0.6  # c of friction between strands, relative to the squared step; see `rod`
 HAIRPIN = 0.01  # least squared cosine of half the angle between two segments: limits divisions
 TINY = 1e-12  # m or m/s; shorter vectors have no direction
 
@@ -71,6 +72,12 @@ def _record(record: Any) -> Any:
 def _part(kernel: Kernel) -> Kernel:
     """Compile a function together with the kernels that call it."""
     compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy')
+    return compile_(kernel)  # type: ignore[no-any-return]
+
+
+def _inlined(kernel: Kernel) -> Kernel:
+    """Compile a function as a piece of the kernels that call it, in their loops."""
+    compile_: Any = numba.njit(inline='always', error_model='numpy')
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
@@ -113,8 +120,8 @@ class FrameState(NamedTuple):
         workspace.
     :param begun: (1,) 1 once the angles are in equilibrium.
     :param segments: (N - 1, 7) workspace: unit tangents, inverse lengths [1/m], and unit vectors across.
-    :param joints: (N - 2, 6) bends in two directions across, inverse cosine of half the bending angle, cosine
-        and sine of the mean angle, and twisting moment [N m].
+    :param joints: (N - 2, 7) bends in two directions across, inverse cosine of half the bending angle, cosine
+        and sine of the mean angle, twisting moment [N m], and cosine of half the bending angle.
     :param turning: (N - 1, 2) workspace.
     """
 
@@ -138,14 +145,17 @@ class SlipState(NamedTuple):
     :param rows: (N - 2, 5) curvature from three nodes [1/m]: multiplied by the points it gives
         t_i - t_(i-1); stiffness [N m] and the change of t_i - t_(i-1) at which the strands slip.  (0, 5):
         there is no such friction.
-    :param kept: (N - 2, 6) t_i - t_(i-1) at which the element is free of stress, and the mean unit tangents
-        in the last step.
+    :param kept: (N - 2, 9) t_i - t_(i-1) at which the element is free of stress; mean unit tangents in the
+        last step; strain in the last step, so far does the bend differ from what is kept.
     :param begun: (1,) 1 once `kept` is known.
+    :param pull: (N, 6) workspace: what the equation of each node gets: diagonal and the two entries below it
+        [kg], and the impulse against the bend [N s].
     """
 
     rows: Matrix
     kept: Matrix
     begun: Indices
+    pull: Matrix
 
 
 @_record
@@ -271,7 +281,7 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     total = 0.0
     for j in range(size - 1, -1, -1):
         value = right[j]
-        for k in range(1, BAND):
+        for k in range(BAND - 1, 0, -1):  # the one that is known last comes last: no waiting
             value -= bands[j, k] * right[j + k]
         right[j] = value
         total += value
@@ -307,41 +317,45 @@ def _perpendicular(tangent: Vector, frame: Vector) -> None:
 
 
 @_part
-def _carry_along(segments: Matrix, joints: Matrix, carried: Matrix, begun: bool) -> None:
-    """Carry the reference frame along the DLO without twist, and write the bends in its directions."""
+def _begin_to_carry(segments: Matrix, carried: Matrix, begun: bool) -> None:
+    """Carry the first vector of the reference frame from where it was in the last step."""
     for c in range(3):
         carried[2, c] = segments[0, c]
     if begun:
         _transport(carried[1], carried[0], carried[2])
     else:
         _perpendicular(carried[2], carried[1])
-    a0, a1, a2 = carried[2, 0], carried[2, 1], carried[2, 2]
-    u0, u1, u2 = carried[1, 0], carried[1, 1], carried[1, 2]
-    carried[0, 0], carried[0, 1], carried[0, 2] = a0, a1, a2
-    for i in range(len(joints)):
-        segments[i, 4], segments[i, 5], segments[i, 6] = u0, u1, u2
-        b0, b1, b2 = segments[i + 1, 0], segments[i + 1, 1], segments[i + 1, 2]
-        square = (1.0 + a0 * b0 + a1 * b1 + a2 * b2) / 2
-        hairpin = square < HAIRPIN
-        if hairpin:
-            square = HAIRPIN
-        half = math.sqrt(square)
-        inverse = 1.0 / half
-        x = (b0 * u0 + b1 * u1 + b2 * u2) * inverse
-        y = (b0 * (a1 * u2 - a2 * u1) + b1 * (a2 * u0 - a0 * u2) + b2 * (a0 * u1 - a1 * u0)) * inverse
-        joints[i, 0], joints[i, 1], joints[i, 2] = x, y, inverse
-        share = x * inverse / 2
-        u0 -= share * (a0 + b0)
-        u1 -= share * (a1 + b1)
-        u2 -= share * (a2 + b2)
-        a0, a1, a2 = b0, b1, b2
-        if hairpin:  # the rotation was not quite one
-            left = u0 * a0 + u1 * a1 + u2 * a2
-            u0, u1, u2 = u0 - left * a0, u1 - left * a1, u2 - left * a2
-            left = 1.0 / math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
-            u0, u1, u2 = left * u0, left * u1, left * u2
-    last = len(joints)
-    segments[last, 4], segments[last, 5], segments[last, 6] = u0, u1, u2
+    for c in range(3):
+        carried[0, c], segments[0, 4 + c] = carried[2, c], carried[1, c]
+
+
+@_inlined
+def _carry_along(segments: Matrix, joints: Matrix, i: int) -> tuple[float, float]:
+    """
+    Carry the reference frame without twist from segment `i` to the next one.
+
+    :returns: components of the bend between them in this frame.
+    """
+    a0, a1, a2 = segments[i, 0], segments[i, 1], segments[i, 2]
+    b0, b1, b2 = segments[i + 1, 0], segments[i + 1, 1], segments[i + 1, 2]
+    u0, u1, u2 = segments[i, 4], segments[i, 5], segments[i, 6]
+    square = (1.0 + a0 * b0 + a1 * b1 + a2 * b2) / 2
+    hairpin = square < HAIRPIN
+    if hairpin:
+        square = HAIRPIN
+    inverse = 1.0 / math.sqrt(square)
+    x = (b0 * u0 + b1 * u1 + b2 * u2) * inverse
+    y = (u0 * (a2 * b1 - a1 * b2) + u1 * (a0 * b2 - a2 * b0) + u2 * (a1 * b0 - a0 * b1)) * inverse
+    joints[i, 0], joints[i, 1], joints[i, 2], joints[i, 6] = x, y, inverse, inverse * square
+    share = x * (inverse / 2)
+    u0, u1, u2 = u0 - share * (a0 + b0), u1 - share * (a1 + b1), u2 - share * (a2 + b2)
+    if hairpin:  # that was not quite a rotation
+        left = u0 * b0 + u1 * b1 + u2 * b2
+        u0, u1, u2 = u0 - left * b0, u1 - left * b1, u2 - left * b2
+        left = 1.0 / math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+        u0, u1, u2 = left * u0, left * u1, left * u2
+    segments[i + 1, 4], segments[i + 1, 5], segments[i + 1, 6] = u0, u1, u2
+    return x, y
 
 
 @_part
@@ -389,18 +403,13 @@ def _turn_freely(natural: Matrix, joints: Matrix) -> None:
 
 
 @_part
-def _face(angles: Vector, joints: Matrix) -> None:
-    """Write cosine and sine of the mean angle at each joint."""
-    for i in range(len(joints)):
-        phi = (angles[i] + angles[i + 1]) / 2
-        joints[i, 3], joints[i, 4] = math.cos(phi), math.sin(phi)
-
-
-@_part
 def _first_angles(frame: FrameState) -> None:
     """Set the angles at the start: between clamps of known direction evenly twisted, else without twist."""
     angles, clamped, clamps, segments = frame.angles, frame.clamped, frame.clamps, frame.segments
-    one, two = _mean_direction(frame.natural, frame.joints)
+    joints = frame.joints
+    for i in range(len(joints)):
+        _carry_along(segments, joints, i)
+    one, two = _mean_direction(frame.natural, joints)
     angles[:] = math.atan2(two, one)
     last = -1
     for s in range(len(clamped)):
@@ -414,27 +423,29 @@ def _first_angles(frame: FrameState) -> None:
             for i in range(last, len(angles)):
                 angles[i] = angles[last] + (there - angles[last]) * min(1.0, (i - last) / (j - last))
         last = j
+    for i in range(len(joints)):
+        phi = (angles[i] + angles[i + 1]) / 2
+        joints[i, 3], joints[i, 4] = math.cos(phi), math.sin(phi)
 
 
 @_part
-def _in_clamps(frame: FrameState) -> None:
-    """Find out how far the segments in clamps must turn; a clamp that has just closed keeps what it finds."""
-    segments, angles, clamped, clamps = frame.segments, frame.angles, frame.clamped, frame.clamps
-    for s in range(len(clamped)):
-        j, clamp = clamped[s, 0], clamps[s]
-        if math.isfinite(clamp[0]):
-            if math.isfinite(clamp[3]):
-                _transport(clamp[:3], clamp[3:6], segments[j, :3])
-            clamp[6] = _angle_of(segments, j, clamp, angles[j]) - angles[j]
-        else:
-            cosine, sine = math.cos(angles[j]), math.sin(angles[j])
-            for c in range(3):
-                d, e = (c + 1) % 3, (c + 2) % 3
-                clamp[c] = cosine * segments[j, 4 + c] + sine * (
-                    segments[j, d] * segments[j, 4 + e] - segments[j, e] * segments[j, 4 + d])
-            clamp[6] = 0.0
-        for c in range(3):
-            clamp[3 + c] = segments[j, c]
+def _turn_of_clamp(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> float:
+    """Return how far [rad] segment `j` must turn in clamp `s`; one that just closed keeps what it finds."""
+    t0, t1, t2 = segments[j, 0], segments[j, 1], segments[j, 2]
+    u0, u1, u2 = segments[j, 4], segments[j, 5], segments[j, 6]
+    v0, v1, v2 = t1 * u2 - t2 * u1, t2 * u0 - t0 * u2, t0 * u1 - t1 * u0
+    d0, d1, d2 = clamps[s, 0], clamps[s, 1], clamps[s, 2]
+    b0, b1, b2 = clamps[s, 3], clamps[s, 4], clamps[s, 5]
+    if not math.isfinite(d0):
+        cosine, sine = math.cos(angles[j]), math.sin(angles[j])
+        d0, d1, d2 = cosine * u0 + sine * v0, cosine * u1 + sine * v1, cosine * u2 + sine * v2
+    elif math.isfinite(b0):  # it goes with the segment, by the smallest rotation
+        share = (d0 * t0 + d1 * t1 + d2 * t2) / max(1.0 + b0 * t0 + b1 * t1 + b2 * t2, 2 * HAIRPIN)
+        d0, d1, d2 = d0 - share * (b0 + t0), d1 - share * (b1 + t1), d2 - share * (b2 + t2)
+    clamps[s, 0], clamps[s, 1], clamps[s, 2] = d0, d1, d2
+    clamps[s, 3], clamps[s, 4], clamps[s, 5] = t0, t1, t2
+    turn: float = math.atan2(d0 * v0 + d1 * v1 + d2 * v2, d0 * u0 + d1 * u1 + d2 * u2) - angles[j]
+    return turn - 2 * math.pi * round(turn / (2 * math.pi))
 
 
 @_part
@@ -457,24 +468,26 @@ def _turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> None:
 
 @_part
 def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped: IndexRows, clamps: Matrix,
-                     joints: Matrix, turning: Matrix) -> None:
+                     segments: Matrix, joints: Matrix, turning: Matrix, begun: bool) -> None:
     """
-    Turn the segments towards the balance of torques about their axes, which have almost no inertia.
+    Carry the reference frame along, and turn the segments towards the balance of torques about their axes.
 
     The energy is that of twist plus ``-|A| cos(delta)`` of natural curvature at each joint, with delta the
     mean angle of both segments from the plane of the bend.  Where delta changes by less than `REACH`, the
     parabola with the curvature ``|A| (cos(delta) + REACH / 3)`` lies nowhere below, so that a Newton step of
     at most that size lowers the energy; where the matrix is not positive definite, its pivots are replaced
     (Nocedal and Wright, Numerical Optimization, 2006, 3.4).
+
+    :param begun: False: clamps of unknown direction do not hold yet.
     """
     n = len(angles)
-    diagonal, right, coupling, upper = 0.0, 0.0, 0.0, 0.0
-    share, next_diagonal, next_right, s = 0.0, 0.0, 0.0, 0
+    coupling, upper, right, share, next_diagonal, next_right, s = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for i in range(n):
         diagonal, right = next_diagonal - share * upper, next_right - share * right
         coupling = 0.0
         if i < n - 1:
-            x, y, stiffness = joints[i, 0], joints[i, 1], twisting[i]
+            x, y = _carry_along(segments, joints, i)
+            stiffness = twisting[i]
             one = natural[i, 0] * joints[i, 3] - natural[i, 1] * joints[i, 4]
             two = natural[i, 0] * joints[i, 4] + natural[i, 1] * joints[i, 3]
             slope = (x * two - y * one) / 2
@@ -488,7 +501,8 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
             diagonal = twisting[i - 1]
         upper = coupling
         if s < len(clamped) and clamped[s, 0] == i:
-            if math.isfinite(clamps[s, 6]):
+            if begun or math.isfinite(clamps[s, 0]):
+                clamps[s, 6] = _turn_of_clamp(segments, angles, clamps, s, i)
                 diagonal, right, upper = 1.0, clamps[s, 6], 0.0
             s += 1
         inverse = 1.0 / diagonal
@@ -498,12 +512,32 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
     for i in range(n - 2, -1, -1):
         turning[i, 0] -= turning[i, 1] * turning[i + 1, 0]
         largest = max(largest, abs(turning[i, 0] + turning[i + 1, 0]))
-    share = 2 * REACH / largest
-    for i in range(n):
-        angles[i] += share * turning[i, 0]
-    for s in range(len(clamped)):
-        if math.isfinite(clamps[s, 6]):
-            angles[clamped[s, 0]] += (1.0 - share) * clamps[s, 6]
+    if largest > 2 * REACH:
+        share = 2 * REACH / largest
+        for i in range(n):
+            turning[i, 0] *= share
+        for s in range(len(clamped)):
+            if begun or math.isfinite(clamps[s, 0]):
+                turning[clamped[s, 0], 0] = clamps[s, 6]
+    angles[0] += turning[0, 0]
+    for i in range(n - 1):
+        angles[i + 1] += turning[i + 1, 0]
+        cosine, sine = _turned(joints[i, 3], joints[i, 4], (turning[i, 0] + turning[i + 1, 0]) / 2)
+        joints[i, 3], joints[i, 4] = cosine, sine
+        joints[i, 5] = twisting[i] * (angles[i + 1] - angles[i])
+
+
+@_inlined
+def _turned(cosine: float, sine: float, angle: float) -> tuple[float, float]:
+    """Return cosine and sine of an angle [rad] that has grown by `angle`."""
+    if abs(angle) < 0.01:
+        q = angle * angle
+        c, s = 1 - q * (0.5 - q * (1 / 24)), angle * (1 - q * (1 / 6 - q * (1 / 120)))
+    else:
+        c, s = math.cos(angle), math.sin(angle)
+    x, y = cosine * c - sine * s, sine * c + cosine * s
+    left = 1.5 - (x * x + y * y) / 2  # so that rounding does not add up
+    return left * x, left * y
 
 
 @_part
@@ -518,127 +552,129 @@ def add_frame(frame: FrameState, turns: Matrix, step: float, right: Vector) -> N
     """
     natural, twisting, angles, begun = frame.natural, frame.twisting, frame.angles, frame.begun
     segments, joints, clamped, clamps = frame.segments, frame.joints, frame.clamped, frame.clamps
-    _carry_along(segments, joints, frame.carried, begun[0] == 1)
+    _begin_to_carry(segments, frame.carried, begun[0] == 1)
     if len(twisting) == 0:
+        for i in range(len(joints)):
+            _carry_along(segments, joints, i)
         _turn_freely(natural, joints)
     else:
         if begun[0] == 0:
             _first_angles(frame)
-            for s in range(len(clamped)):
-                if math.isfinite(clamps[s, 0]):
-                    clamps[s, 6] = 0.0
             for _ in range(FIRST_TURNS):
-                _face(angles, joints)
-                _balance_torques(natural, twisting, angles, clamped, clamps, joints, frame.turning)
-            _face(angles, joints)
-        _in_clamps(frame)
-        _balance_torques(natural, twisting, angles, clamped, clamps, joints, frame.turning)
-        _face(angles, joints)
-        for i in range(len(joints)):
-            joints[i, 5] = twisting[i] * (angles[i + 1] - angles[i])
+                _balance_torques(natural, twisting, angles, clamped, clamps, segments, joints, frame.turning,
+                                 False)
+        _balance_torques(natural, twisting, angles, clamped, clamps, segments, joints, frame.turning, True)
         _turn_clamps(clamped, clamps, turns)
     begun[0] = 1
-    p0, p1, p2 = 0.0, 0.0, 0.0  # torque [N m] of the joint before
+    g0, g1, g2 = 0.0, 0.0, 0.0  # torque [N m] on the segment, turned by a right angle
     for i in range(len(joints) + 1):
-        a0, a1, a2, inverse = segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3]
-        q0, q1, q2 = 0.0, 0.0, 0.0  # of the joint behind
+        a0, a1, a2 = segments[i, 0], segments[i, 1], segments[i, 2]
+        h0, h1, h2 = 0.0, 0.0, 0.0  # on the next one
         if i < len(joints):
-            m0, m1, m2 = a0 + segments[i + 1, 0], a1 + segments[i + 1, 1], a2 + segments[i + 1, 2]
+            b0, b1, b2 = segments[i + 1, 0], segments[i + 1, 1], segments[i + 1, 2]
             u0, u1, u2 = segments[i, 4], segments[i, 5], segments[i, 6]
-            one = natural[i, 0] * joints[i, 3] - natural[i, 1] * joints[i, 4]
-            two = natural[i, 0] * joints[i, 4] + natural[i, 1] * joints[i, 3]
+            inverse, half = joints[i, 2], joints[i, 6]
+            one = half * (natural[i, 0] * joints[i, 3] - natural[i, 1] * joints[i, 4])
+            two = half * (natural[i, 0] * joints[i, 4] + natural[i, 1] * joints[i, 3])
             d0 = one * u0 + two * (a1 * u2 - a2 * u1)
             d1 = one * u1 + two * (a2 * u0 - a0 * u2)
             d2 = one * u2 + two * (a0 * u1 - a1 * u0)
-            half = joints[i, 2] / 2
-            twist = 2 * half * joints[i, 5]
-            q0 = half * (m1 * d2 - m2 * d1 - twist * m0)
-            q1 = half * (m2 * d0 - m0 * d2 - twist * m1)
-            q2 = half * (m0 * d1 - m1 * d0 - twist * m2)
-        t0, t1, t2 = p0 - q0, p1 - q1, p2 - q2
-        p0, p1, p2 = q0, q1, q2
-        share = step * inverse
-        f0, f1, f2 = share * (t1 * a2 - t2 * a1), share * (t2 * a0 - t0 * a2), share * (t0 * a1 - t1 * a0)
+            share = (one * joints[i, 0] + two * joints[i, 1]) * (inverse / 2)
+            twist = joints[i, 5] * (inverse * inverse / 2)
+            n0, n1, n2 = twist * (a1 * b2 - a2 * b1), twist * (a2 * b0 - a0 * b2), twist * (a0 * b1 - a1 * b0)
+            g0, g1, g2 = g0 - d0 - n0, g1 - d1 - n1, g2 - d2 - n2
+            h0, h1, h2 = d0 - share * (a0 + b0) - n0, d1 - share * (a1 + b1) - n1, d2 - share * (a2 + b2) - n2
+        share = step * segments[i, 3]
         j = 3 * i
-        right[j] -= f0
-        right[j + 1] -= f1
-        right[j + 2] -= f2
-        right[j + 3] += f0
-        right[j + 4] += f1
-        right[j + 5] += f2
+        right[j] -= share * g0
+        right[j + 1] -= share * g1
+        right[j + 2] -= share * g2
+        right[j + 3] += share * g0
+        right[j + 4] += share * g1
+        right[j + 5] += share * g2
+        g0, g1, g2 = h0, h1, h2
 
 
 @_part
-def add_friction(friction: SlipState, points: Matrix, velocities: Matrix, implicit: float, step: float,
-                 bands: Matrix, right: Vector) -> None:
+def rub(friction: SlipState, points: Matrix, step: float) -> None:
     """
-    Add to `right` the impulses [N s] of friction between strands, and its stiffness to `bands`; see `rod`.
+    Write to `friction.pull` what friction between strands adds to the equations of the nodes; see `rod`.
 
     The element is elastic and perfectly plastic (Iwan, A Distributed-Element Model for Hysteresis, 1966):
     where the bend is further than `slip` from the one that is kept, the latter follows.  What is kept turns
     with the DLO by the smallest rotation of the mean tangent.  Where the strands are going to slip in this
     step, the stiffness is that of the secant: a larger one would brake too much, a smaller one rattle.
-
-    :param implicit: c [s^2] of the step; see `rod`.
     """
-    rows, kept = friction.rows, friction.kept
-    begun, ahead = friction.begun[0] == 1, implicit / step
+    rows, kept, pull = friction.rows, friction.kept, friction.pull
+    begun, implicit = friction.begun[0] == 1, AHEAD * step * step
     friction.begun[0] = 1
+    for i in range(len(rows)):  # loops that are short run in parallel inside a processor
+        tx, ty = points[i + 2, 0] - points[i, 0], points[i + 2, 1] - points[i, 1]
+        tz = points[i + 2, 2] - points[i, 2]
+        share = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
+        pull[i, 0], pull[i, 1], pull[i, 2], pull[i, 3] = share * tx, share * ty, share * tz, share
+    d0, d1, o1 = 0.0, 0.0, 0.0  # of the next two nodes: diagonal and the entry below
+    fx, fy, fz, gx, gy, gz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # and impulses
     for i in range(len(rows)):
         r0, r1, r2, stiffness, slip = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4]
-        x0, y0, z0 = points[i, 0], points[i, 1], points[i, 2]
-        x2, y2, z2 = points[i + 2, 0], points[i + 2, 1], points[i + 2, 2]
-        bx = r0 * x0 + r1 * points[i + 1, 0] + r2 * x2
-        by = r0 * y0 + r1 * points[i + 1, 1] + r2 * y2
-        bz = r0 * z0 + r1 * points[i + 1, 2] + r2 * z2
-        tx, ty, tz = x2 - x0, y2 - y0, z2 - z0
-        size = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
-        tx, ty, tz = size * tx, size * ty, size * tz
-        px, py, pz = bx, by, bz
+        bx = r0 * points[i, 0] + r1 * points[i + 1, 0] + r2 * points[i + 2, 0]
+        by = r0 * points[i, 1] + r1 * points[i + 1, 1] + r2 * points[i + 2, 1]
+        bz = r0 * points[i, 2] + r1 * points[i + 1, 2] + r2 * points[i + 2, 2]
+        tx, ty, tz, inverse = pull[i, 0], pull[i, 1], pull[i, 2], pull[i, 3]
+        ex, ey, ez, next_x, next_y, next_z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if begun:
             px, py, pz = kept[i, 0], kept[i, 1], kept[i, 2]
             sx, sy, sz = kept[i, 3], kept[i, 4], kept[i, 5]
             along = 2 * (sx * px + sy * py + sz * pz)
             sx, sy, sz = sx + tx, sy + ty, sz + tz
-            share = 2 * (sx * px + sy * py + sz * pz) / max(sx * sx + sy * sy + sz * sz, 4 * HAIRPIN)
-            px += along * tx - share * sx
-            py += along * ty - share * sy
-            pz += along * tz - share * sz
-        ex, ey, ez = bx - px, by - py, bz - pz
-        square = ex * ex + ey * ey + ez * ez
-        if square > slip * slip:  # the strands have slipped
-            share = slip / math.sqrt(square)
+            share = (sx * px + sy * py + sz * pz) * _inverse(sx * sx + sy * sy + sz * sz) * 2
+            ex = bx - px - along * tx + share * sx
+            ey = by - py - along * ty + share * sy
+            ez = bz - pz - along * tz + share * sz
+            next_x = AHEAD * (ex - kept[i, 6])
+            next_y = AHEAD * (ey - kept[i, 7])
+            next_z = AHEAD * (ez - kept[i, 8])
+            share = _limited(ex, ey, ez, slip)
             ex, ey, ez = share * ex, share * ey, share * ez
-            px, py, pz = bx - ex, by - ey, bz - ez
+        px, py, pz = bx - ex, by - ey, bz - ez
         kept[i, 0], kept[i, 1], kept[i, 2] = px, py, pz
         kept[i, 3], kept[i, 4], kept[i, 5] = tx, ty, tz
-        bx = ex + ahead * (r0 * velocities[i, 0] + r1 * velocities[i + 1, 0] + r2 * velocities[i + 2, 0])
-        by = ey + ahead * (r0 * velocities[i, 1] + r1 * velocities[i + 1, 1] + r2 * velocities[i + 2, 1])
-        bz = ez + ahead * (r0 * velocities[i, 2] + r1 * velocities[i + 1, 2] + r2 * velocities[i + 2, 2])
-        square = bx * bx + by * by + bz * bz
-        if square > slip * slip:
-            stiffness *= slip / math.sqrt(square)
+        kept[i, 6], kept[i, 7], kept[i, 8] = ex, ey, ez
+        stiffness *= _limited(ex + next_x, ey + next_y, ez + next_z, slip)
         weight, moment = implicit * stiffness, step * stiffness
-        j = 3 * i
         ex, ey, ez = moment * ex, moment * ey, moment * ez
-        right[j] -= r0 * ex
-        right[j + 1] -= r0 * ey
-        right[j + 2] -= r0 * ez
-        right[j + 3] -= r1 * ex
-        right[j + 4] -= r1 * ey
-        right[j + 5] -= r1 * ez
-        right[j + 6] -= r2 * ex
-        right[j + 7] -= r2 * ey
-        right[j + 8] -= r2 * ez
-        w00, w01, w02 = weight * r0 * r0, weight * r0 * r1, weight * r0 * r2
-        w11, w12, w22 = weight * r1 * r1, weight * r1 * r2, weight * r2 * r2
-        for k in range(j, j + 3):
-            bands[k, 0] += w00
-            bands[k, 3] += w01
-            bands[k, 6] += w02
-            bands[k + 3, 0] += w11
-            bands[k + 3, 3] += w12
-            bands[k + 6, 0] += w22
+        # What is kept turns with the outer nodes, so that they bear the torque on it.
+        along, share = inverse * (px * tx + py * ty + pz * tz), inverse * (ex * tx + ey * ty + ez * tz)
+        qx, qy, qz = along * ex - share * px, along * ey - share * py, along * ez - share * pz
+        pull[i, 0], pull[i, 1], pull[i, 2] = d0 + weight * r0 * r0, o1 + weight * r0 * r1, weight * r0 * r2
+        pull[i, 3], pull[i, 4], pull[i, 5] = fx + r0 * ex + qx, fy + r0 * ey + qy, fz + r0 * ez + qz
+        d0, o1, d1 = d1 + weight * r1 * r1, weight * r1 * r2, weight * r2 * r2
+        fx, fy, fz = gx + r1 * ex, gy + r1 * ey, gz + r1 * ez
+        gx, gy, gz = r2 * ex - qx, r2 * ey - qy, r2 * ez - qz
+    n = len(rows)
+    pull[n, 0], pull[n, 1], pull[n, 2], pull[n, 3], pull[n, 4], pull[n, 5] = d0, o1, 0.0, fx, fy, fz
+    pull[n + 1, 0], pull[n + 1, 1], pull[n + 1, 2] = d1, 0.0, 0.0
+    pull[n + 1, 3], pull[n + 1, 4], pull[n + 1, 5] = gx, gy, gz
+
+
+@_inlined
+def _limited(x: float, y: float, z: float, most: float) -> float:
+    """Return by how much a vector must be multiplied so that it is not longer than `most`."""
+    square = x * x + y * y + z * z
+    share = 1.0
+    if square > most * most:
+        share = most / math.sqrt(square)
+    return share
+
+
+@_inlined
+def _inverse(square: float) -> float:
+    """Return 1 / square, the squared length of the sum of two unit vectors, which are mostly parallel."""
+    away = 1.0 - square / 4
+    inverse = (1.0 + away * (1.0 + away * (1.0 + away))) / 4
+    if away > 1e-4:
+        inverse = 1.0 / max(square, 4 * HAIRPIN)
+    return inverse
 
 
 @_part
@@ -656,18 +692,27 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Mat
     n = len(points)
     size = 3 * n
     framed, segments = len(rod.frame.angles) > 0, rod.frame.segments
-    for j in range(size):
-        for k in range(BAND):
-            bands[j, k] = 0.0
+    rubs, pull = len(rod.friction.rows) > 0, rod.friction.pull
+    if rubs:
+        rub(rod.friction, points, step)
     right[size:] = 0.0
     bands[size:] = 0.0
     for i in range(n):
         diagonal = masses[i] * (1.0 + drag * step) + implicit * bending[0, i]
+        first, second = implicit * bending[1, i], implicit * bending[2, i]
+        if rubs:
+            diagonal += pull[i, 0]
+            first += pull[i, 1]
+            second += pull[i, 2]
         for c in range(3):
             j = 3 * i + c
             bands[j, 0] = diagonal
-            bands[j, 3] = implicit * bending[1, i]
-            bands[j, 6] = implicit * bending[2, i]
+            bands[j, 1] = 0.0
+            bands[j, 2] = 0.0
+            bands[j, 3] = first
+            bands[j, 4] = 0.0
+            bands[j, 5] = 0.0
+            bands[j, 6] = second
             force = bending[0, i] * points[i, c]
             if i + 1 < n:
                 force += bending[1, i] * points[i + 1, c]
@@ -678,20 +723,21 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Mat
             if i > 1:
                 force += bending[2, i - 2] * points[i - 2, c]
             right[j] = masses[i] * velocities[i, c] - step * force
+            if rubs:
+                right[j] -= pull[i, 3 + c]
     for i in range(n - 1):
         x = points[i + 1, 0] - points[i, 0]
         y = points[i + 1, 1] - points[i, 1]
         z = points[i + 1, 2] - points[i, 2]
         square = x * x + y * y + z * z
-        length = math.sqrt(square)
-        slack = 1.0 - rest[i] / length
+        inverse = 1.0 / math.sqrt(square)
+        slack = 1.0 - rest[i] * inverse
         if framed:
-            inverse = 1.0 / length
             segments[i, 0], segments[i, 1], segments[i, 2] = x * inverse, y * inverse, z * inverse
             segments[i, 3] = inverse
         tension = stiffness[i] * slack * step
         across = max(slack, 0.0) * stiffness[i]
-        along = implicit * (stiffness[i] - across) / square
+        along = implicit * (stiffness[i] - across) * inverse * inverse
         across *= implicit
         xx, yy, zz = along * x * x + across, along * y * y + across, along * z * z + across
         xy, xz, yz = along * x * y, along * x * z, along * y * z
@@ -720,8 +766,6 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Mat
         bands[j + 2, 3] -= zz
     if framed:
         add_frame(rod.frame, turns, step, right)
-    if len(rod.friction.rows) > 0:
-        add_friction(rod.friction, points, velocities, 0.6 * step * step, step, bands, right)
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
         for c in range(3):

@@ -30,9 +30,11 @@ inertia about its axis, so that the angles are those of least energy: a clamp pr
 free ends and pins are without torque.  Where clamps are not to hold the DLO (torsion 0), it turns
 freely as a whole, and does not twist.
 
-Strands that rub on each other resist bending as an elastic, perfectly plastic element beside the elastic
-one.  Its state is the bend p_i at which it is free of stress, at first that of the start:
-``e = t_i - t_(i-1) - p_i`` causes the moment ``k EI e / l``, and where |e| exceeds ``l slip``, p_i follows.
+Strands that rub on each other resist bending as an elastic, perfectly plastic element beside the
+elastic one.  Its state is the bend p_i at which it is free of stress, at first that of the start:
+``e = t_i - t_(i-1) - p_i`` causes the moment ``k EI e / l``, and where |e| exceeds ``l slip``, p_i
+follows.  p_i turns with the DLO by the smallest rotation; the nodes that turn it bear the torque,
+without which the element would gain energy.
 
 `kernels` take the step; this module computes their input.  If parts of the DLO differ in
 stiffness, an inner node has the stiffness of the pieces on its two sides in series.
@@ -208,7 +210,9 @@ class Rod:
         slip = properties.bending_slip
         rows = np.column_stack([_curvature_rows(self.state.rest_lengths),
                                 joints * (properties.bending_friction / slip), cells * slip])
-        return before._replace(rows=rows, kept=before.kept if len(before.kept) else np.zeros((len(cells), 6)))
+        if not len(before.rows):
+            before = before._replace(kept=np.zeros((len(cells), 9)), pull=np.zeros((len(cells) + 2, 6)))
+        return before._replace(rows=rows)
 
     def _stiffnesses(self, rigid: NDArray[np.bool_]) -> Floats:
         """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
@@ -240,7 +244,7 @@ def _frame_of(segments: int) -> FrameState:
     return FrameState(
         natural=np.zeros((joints, 3)), twisting=np.zeros(0), angles=np.zeros(segments),
         clamped=np.zeros((0, 2), np.int64), clamps=np.zeros((0, 7)), carried=np.zeros((3, 3)),
-        begun=np.zeros(1, np.int64), segments=np.zeros((segments, 7)), joints=np.zeros((joints, 6)),
+        begun=np.zeros(1, np.int64), segments=np.zeros((segments, 7)), joints=np.zeros((joints, 7)),
         turning=np.zeros((segments, 2)))
 
 
@@ -251,7 +255,8 @@ def _no_frame() -> FrameState:
 
 def _no_friction() -> SlipState:
     """Return the state of a DLO without friction between strands."""
-    return SlipState(rows=np.zeros((0, 5)), kept=np.zeros((0, 6)), begun=np.zeros(1, np.int64))
+    return SlipState(rows=np.zeros((0, 5)), kept=np.zeros((0, 9)), begun=np.zeros(1, np.int64),
+                     pull=np.zeros((0, 6)))
 
 
 def _curvature_rows(rest_lengths: Floats) -> Floats:

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Friction between the strands of a DLO: loops of moment and curvature, energy, and bends that stay."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from stepping import SteppedRod as Rod
+from test_rod import crumpled, energy, FREE, NONE, straight
+
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.bullet import BulletRope, pybullet
+from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.rod import RodProperties
+
+STIFFNESS, KEPT, SLIP = 1e-3, 2.0, 0.5
+
+
+def moments(curvatures, steps=50):
+    """Return the moment [N m] of friction at the middle of three nodes that are bent to each curvature."""
+    length = 0.05
+    properties = RodProperties(STIFFNESS, 1e4, 0.01, bending_friction=KEPT, bending_slip=SLIP)
+    rod = Rod(np.full(2, length), properties, 1e-9)
+    found, before = [], 0.0
+    for curvature in curvatures:
+        for now in np.linspace(before, curvature, steps + 1)[1:]:
+            angle = length * now / 2
+            end = length * np.array([np.cos(angle), np.sin(angle), 0])
+            points = np.array([end * (-1, 1, 1), (0, 0, 0), end])
+            kernels.rub(rod.state.friction, points, 1e-9)
+        found.append(-rod.state.friction.pull[1, 4] / 1e-9 * length / 2)
+        before = curvature
+    return np.array(found)
+
+
+def test_moment_and_curvature_go_around_a_closed_loop():
+    up = np.linspace(0, 4, 81)
+    virgin = moments(up)
+    assert virgin[[1, -1]] == pytest.approx(STIFFNESS * KEPT * np.array([0.05 / SLIP, 1.0]), rel=0.01)
+    cycle = np.concatenate([up, up[::-1][1:], -up[1:], -up[::-1][1:], up[1:]])
+    moment = moments(cycle)
+    # Masing: the curve of unloading is that of loading, twice as large, from the point of reversal.
+    doubled = np.interp(np.arange(161) / 2, np.arange(81), virgin)
+    assert moment[80:241] == pytest.approx(moment[80] - 2 * doubled, abs=0.01 * STIFFNESS * KEPT)
+    assert moment[-1] == pytest.approx(moment[80])  # closed
+    area = np.sum((moment[81:] + moment[80:-1]) / 2 * np.diff(cycle[80:]))
+    assert area == pytest.approx(4 * STIFFNESS * KEPT * (4 - SLIP), rel=0.02)  # lost in each cycle
+
+
+def test_the_loop_does_not_depend_on_the_rate():
+    curvatures = np.array([1.0, 0.2, 0.9, -2.0, 0.3, 3.0])
+    assert moments(curvatures, 2000) == pytest.approx(moments(curvatures, 1000), rel=2e-3)
+
+
+def stored(rod, points):
+    """Return the energy [J] in the elements at these points."""
+    state = kernels.SlipState(*(array.copy() for array in rod.state.friction))
+    kernels.rub(state, points, rod.state.step)
+    return (state.rows[:, 3] * (state.kept[:, 6:]**2).sum(axis=1)).sum() / 2
+
+
+@settings(derandomize=True, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 30), st.floats(0.001, 10),
+       st.sampled_from([0.001, 0.004, 0.01]))
+def test_friction_never_gains_energy(seed, bending, kept, slip, step):
+    generator = np.random.default_rng(seed)
+    rest = generator.uniform(0.02, 0.05, 15)
+    properties = RodProperties(bending, 1e3, 0.05, bending_friction=kept, bending_slip=slip)
+    rod = Rod(rest, properties, step)
+    points = crumpled(seed, rest, 0.05)
+    velocities = generator.normal(0, 0.1, points.shape)
+    velocities -= velocities.mean(axis=0)
+
+    def total():
+        return energy(points, rest, properties) + (rod.state.masses[:, None] * velocities**2).sum() / 2
+
+    start = total()
+    for _ in range(200):
+        velocities = rod.velocities(points, velocities, NONE, FREE)
+        points = points + step * velocities
+        assert total() + stored(rod, points) < 1.05 * start
+    assert total() + stored(rod, points) < start
+
+
+@pytest.mark.parametrize('kept', [0.0, 2.0, 5.0])
+def test_a_bend_stays_on_a_table(kept):
+    """An arc of 12 1/m is let go: it opens slowly, up to the curvature whose moment friction bears."""
+    count, length = 30, 0.3
+    places = np.linspace(0, length, count + 1)
+    points = np.stack([places, np.zeros(count + 1), np.zeros(count + 1)], axis=1)
+    physical = {**ParameterSpace().physical({}, length), 'flexibility': 2e-3, 'mass': 0.02, 'damping': 200.0,
+                'friction': 0.0, 'bending_friction': kept, 'bending_slip': 0.2}
+    rope = CompiledRope(places, points, np.zeros_like(points), physical, 0.003, level=0.0)
+    held = (0, 15, 30)
+    rope.hold(held)
+    curvatures = np.linspace(0, 12, 400)[1:, None]
+    angles = curvatures * places[list(held)]
+    way = np.stack([np.sin(angles) / curvatures, (1 - np.cos(angles)) / curvatures, 0 * angles], axis=2)
+    rope.advance(way)
+    rope.hold(())
+    rope.advance(np.zeros((3000, 0, 3)))
+    tangents = np.diff(rope.points, axis=0)
+    headings = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
+    curvature = np.diff(headings)[8:-8].mean() / (length / count)
+    assert curvature == pytest.approx(kept, rel=0.15, abs=0.05)
+
+
+def test_without_friction_the_rod_is_what_it_was_bit_for_bit():
+    rest = np.random.default_rng(0).uniform(0.02, 0.05, 12)
+    points = crumpled(1, rest)
+    plain, other = (Rod(rest, RodProperties(1e-2, 500.0, 0.05, **given_), 0.004).velocities(
+        points, points, NONE, FREE) for given_ in ({}, {'bending_friction': 0.0, 'bending_slip': 3.0}))
+    assert plain.tobytes() == other.tobytes()
+
+
+ALL = {**ParameterSpace().physical({}, 0.6), 'flexibility': 2e-3, 'mass': 0.06, 'damping': 1.0,
+       'torsion': 0.8, 'bending_friction': 1.0, 'bending_slip': 0.1, 'natural_curvature': 1.0,
+       'self_collision': 0.002,
+       **{f'rest_curvature_{axis}{knot}': (-1)**knot * 2.0 for axis in 'xy' for knot in (1, 2, 3)}}
+PLACES = np.linspace(0, 0.6, 21)
+COURSE = ((0, 1, 19, 20), (0, 1), (0, 1, 10, 19, 20), (), (0, 1, 19, 20))
+
+
+def wave(points, nodes, steps=60):
+    """Return targets and turns of held nodes."""
+    swing = np.sin(np.linspace(0, np.pi, steps))[:, None, None] * (0.0, 0.05, 0.05)
+    turn = np.array([[1, 0, 0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]]).reshape(9)
+    targets = points[list(nodes)] + swing * np.ones((1, len(nodes), 1))
+    return targets, np.tile(turn, (steps, len(nodes), 1))
+
+
+def rope(physical=ALL):
+    points = straight(np.diff(PLACES)) + 0.001 * np.random.default_rng(3).normal(size=(21, 3))
+    return CompiledRope(PLACES, points, np.zeros_like(points), physical, 0.003)
+
+
+def test_ropes_that_take_turns_are_what_each_is_alone():
+    alone = [rope(), rope({**ALL, 'torsion': 0.3})]
+    together = [rope(), rope({**ALL, 'torsion': 0.3})]
+    for one in alone:
+        for nodes in COURSE:
+            one.hold(nodes)
+            one.advance(wave(one.points, nodes)[0], turns=wave(one.points, nodes)[1])
+    for nodes in COURSE:
+        for one in together:
+            one.hold(nodes)
+            targets, turns = wave(one.points, nodes)
+            for k in range(60):
+                one.advance(targets[k:k + 1], turns=turns[k:k + 1])
+    for one, other in zip(alone, together, strict=True):
+        assert np.isfinite(one.points).all()
+        assert one.points.tobytes() == other.points.tobytes()
+
+
+def test_bullet_and_the_compiled_engine_take_the_same_steps():
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setPhysicsEngineParameter(fixedTimeStep=0.003, physicsClientId=client)
+    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+    one = rope()
+    other = BulletRope(client, PLACES, one.points, ALL)
+    for nodes in COURSE:
+        one.hold(nodes)
+        other.hold(nodes)
+        targets, turns = wave(one.points, nodes)
+        one.advance(targets, turns=turns)
+        other.advance(targets, turns=turns)
+        assert other.points == pytest.approx(one.points, abs=1e-9)
+    pybullet.disconnect(physicsClientId=client)

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A rest shape in a material frame: textbook shapes, and what turning a clamp does to a coiled DLO."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp
+from stepping import SteppedRod as Rod
+from test_rod import GRAVITY, NONE, straight
+
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.bullet import BulletSimulator
+from dlo_calibration.simulation.compiled import CompiledSimulator
+from dlo_calibration.simulation.rod import RodProperties
+
+
+def settled(rod, points, gravity=NONE, steps=2000):
+    velocities = np.zeros_like(points)
+    for _ in range(steps):
+        velocities = rod.velocities(points, velocities, gravity, np.zeros((len(rod.state.held), 3)))
+        points = points + rod.state.step * velocities
+    return points
+
+
+@pytest.mark.parametrize(('torsion', 'curvature'), [(0.0, -3.0), (0.8, 3.0)])
+def test_a_coiled_cantilever_hangs_like_the_elastica(torsion, curvature):
+    """
+    EI (angle' - k)' = w (L - s) cos(angle), angle(0) = 0, angle'(L) = k, for a weight w per length.
+
+    A clamp that does not hold the material frame (torsion 0) would let a coil turn that curls upwards.
+    """
+    stiffness, load = 2e-3, 0.05 * 9.81 / 2e-3
+    rest = np.concatenate([[0.01], np.full(40, 0.01)])
+    rod = Rod(rest, RodProperties(stiffness, 1e4, 0.05 * rest.sum(), 4.0, 0.03,
+                                  natural_curvature=abs(curvature), torsion=torsion), 0.004)
+    rod.hold((0, 1))
+    points = straight(rest)
+    points[2:, 2] += 0.5 * curvature * (points[2:, 0] - 0.01)**2
+    points = settled(rod, points, GRAVITY)
+    along = np.linspace(0, 0.4, 41)
+    found = solve_bvp(
+        lambda s, y: np.array([y[1], load * (0.4 - s) * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])]),
+        lambda a, b: np.array([a[0], b[1] - curvature, a[2], a[3]]), along, np.zeros((4, 41)))
+    assert found.success
+    x, z = found.sol(along)[2:]
+    assert points[1:] == pytest.approx(np.stack([0.01 + x, 0 * x, z], axis=1), abs=0.002)
+
+
+@pytest.mark.parametrize(('share', 'leaves'), [(0.92, False), (1.08, True)])
+def test_a_twisted_ring_leaves_its_plane_when_twisted_too_much(share, leaves):
+    """
+    Michell: an elastic ring is unstable if it is twisted by more than 2 pi sqrt(3) EI / GJ.
+
+    Two clamps side by side, whose directions agree, hold the cross-section at which the ring was closed.
+    """
+    torsion, count = 1.2, 48
+    corners = 2 * np.pi * np.arange(count + 1) / count
+    points = 0.25 * np.stack([np.sin(corners), 1 - np.cos(corners), 0 * corners], axis=1)
+    points = np.concatenate([[[-1e-3, 0, 0]], points, [[1e-3, 0, 0]]])
+    rest = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    rod = Rod(rest, RodProperties(1e-3, 1e4, 0.05, 1.0, 0.005, torsion=torsion), 0.004)
+    rod.hold((0, 1, count + 1, count + 2))
+    points[2:-2] += 1e-5 * np.random.default_rng(0).normal(size=(count - 1, 3))
+    rod.frame_forces(points)
+    rod.turned(points, {count + 1: (share * 2 * np.pi * np.sqrt(3) / torsion, 0, 0)})
+    away = 0.0
+    for _ in range(8):
+        points = settled(rod, points, steps=250)
+        away = max(away, np.abs(points[:, 2]).max())
+    # The corners of the chain bend it out of the plane by a little.
+    assert away > 0.1 if leaves else away < 0.003, away
+
+
+def test_a_clamp_that_turns_carries_the_coil_around():
+    rest = np.concatenate([[0.01], np.full(24, 0.02)])
+    rod = Rod(rest, RodProperties(2e-3, 1e4, 0.05, 3.0, 0.02, natural_curvature=2.5, torsion=1.0), 0.004)
+    rod.hold((0, 1))
+    points = straight(rest)
+    points[2:, 1] += 0.5 * 2.5 * (points[2:, 0] - 0.01)**2
+    before = settled(rod, points)
+    rod.turned(before, {0: (np.pi / 2, 0, 0)})
+    after = settled(rod, before)
+    assert np.abs(before[:, 1]).max() > 0.1
+    assert after == pytest.approx(np.stack([before[:, 0], 0 * before[:, 1], before[:, 1]], axis=1), abs=1e-3)
+
+
+def test_free_ends_and_pins_bear_no_torque():
+    rest = np.full(20, 0.03)
+    shape = tuple(np.random.default_rng(1).normal(0, 4, (5, 2)))
+    for held in ((), (0, 20), (0, 1, 20)):
+        rod = Rod(rest, RodProperties(2e-3, 1e4, 0.05, 3.0, 0.02, torsion=0.8, rest_curvature=shape), 0.004)
+        rod.hold(held)
+        points = straight(rest) + 0.003 * np.random.default_rng(2).normal(size=(21, 3))
+        points = settled(rod, points, GRAVITY if held else NONE, 800)
+        state = rod.state.frame
+        moments = state.twisting * np.diff(state.angles)
+        one, two = (state.natural[:, 0] * state.joints[:, 3] - state.natural[:, 1] * state.joints[:, 4],
+                    state.natural[:, 0] * state.joints[:, 4] + state.natural[:, 1] * state.joints[:, 3])
+        slopes = (state.joints[:, 0] * two - state.joints[:, 1] * one) / 2
+        torques = np.concatenate([moments - slopes, [0.0]]) - np.concatenate([[0.0], moments + slopes])
+        assert np.abs(torques[1 if 1 in held else 0:]).max() < 2e-3 * np.abs(moments).max()
+
+
+def around(turn):
+    """Return a trial: a coiled cable between two hands, one of which turns about its axis by `turn` [rad]."""
+    points = np.stack([np.linspace(0, 0.5, 21), np.zeros(21), np.full(21, 0.5)], axis=1)
+    points[1:-1, 2] -= 0.2 * (points[1:-1, 0] - 0.025) * (0.475 - points[1:-1, 0])
+    quaternions = [[np.sin(angle / 2), 0, 0, np.cos(angle / 2)] for angle in (0, turn / 2, turn)]
+    hands = (Hand('left', (0, 1), [0.0, 0.5, 1.0], [points[0]] * 3, quaternions),
+             Hand('right', (19, 20), [0.0, 1.0], [points[20]] * 2))
+    return Trial('turn', Chain(points), (Action(hands),),
+                 (Goal(Chain(points), 1.0, stable=False, held_by=('left', 'right')),
+                  Goal(Chain(points), 2.0, stable=False, held_by=('left', 'right'))))
+
+
+@pytest.mark.parametrize('engine', [CompiledSimulator, BulletSimulator])
+def test_a_hand_that_turns_about_the_axis_turns_the_dlo(engine):
+    simulator = engine(table=False, nodes=21)
+    physical = {**ParameterSpace().physical({}, 0.5), 'flexibility': 2e-3, 'damping': 3.0, 'torsion': 0.8,
+                'natural_curvature': 3.0}
+    plain, turned, back = (simulator.simulate(around(turn), physical).chains for turn in (0.0, 3.0, -3.0))
+    assert np.abs(turned[-1] - plain[-1]).max() > 0.004
+    # What turns to the other side swings to the other side of the plane.
+    assert back[-1] == pytest.approx(turned[-1] * (1, -1, 1), abs=1e-6)
+    without = {**physical, 'torsion': 0.0}
+    assert simulator.simulate(around(3.0), without).chains == pytest.approx(
+        simulator.simulate(around(0.0), without).chains, abs=1e-9)
+    simulator.close()
