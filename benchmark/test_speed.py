@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from dlo_calibration.files.session import read_session
+from dlo_calibration.model.parameters import knot_names, ParameterSpace
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
-from dlo_calibration.simulation.compiled import CompiledSimulator
+from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
 
 NODES = (12, 30, 60, 120)
 ROUNDS = 7
@@ -33,9 +34,9 @@ def object1():
 @pytest.fixture(scope='module')
 def tables():
     """Collect the rows, and write the tables when they are complete."""
-    speeds, trials, parts = [], [], []
-    yield speeds, trials, parts
-    if len(parts) < len(NODES) or len(trials) < len(ACTIONS):
+    speeds, trials, parts, cables = [], [], [], []
+    yield speeds, trials, parts, cables
+    if len(parts) < len(NODES) or len(trials) < len(ACTIONS) or not cables:
         return  # a part was measured alone
     nodes = np.log([row[0] for row in speeds])
     growth = [np.polyfit(nodes, np.log([row[column] for row in speeds]), 1)[0] for column in (4, 5)]
@@ -48,6 +49,8 @@ def tables():
         f'{growth[0]:.2f} (bullet) and {growth[1]:.2f} (compiled; {last:.2f} from {NODES[-2]} to '
         f'{NODES[-1]}).',
         table(['trial, 41 nodes', 'bullet, ms', 'compiled, ms', 'ratio', 'steps'], trials),
+        'A cable of 41 nodes that two clamps swing in the air:',
+        table(['physics', 'compiled, µs per step', 'relative to plain'], cables),
         'What a compiled round is spent on, in µs:',
         table(['nodes', 'whole', 'Python', 'table of distances', 'self-contact', 'rod and table',
                'Python, share', 'self-contact, share'], parts)]))
@@ -81,6 +84,30 @@ def test_trial(benchmark, number, tables):
     tables[1].append([ACTIONS[number], f'{1e3 * seconds["bullet"]:.1f}', f'{1e3 * seconds["compiled"]:.2f}',
                       f'{seconds["bullet"] / seconds["compiled"]:.0f}', steps['compiled']])
     engines['bullet'].close()
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_cables(benchmark, tables):
+    """Measure a step with each piece of physics, and with all of it."""
+    places, held, count = np.linspace(0, 1.2, 41), [0, 1, 39, 40], 200
+    points = np.stack([places, 0.05 * np.sin(4 * places), np.zeros(41)], axis=1)
+    plain = {**ParameterSpace().physical({}, 1.2), 'flexibility': 2e-3, 'mass': 0.1, 'damping': 1.0,
+             'self_collision': 0.003}
+    frame = {'torsion': 0.7, **{name: 3.0 * (-1)**k for k, name in enumerate(knot_names(9))}}
+    friction = {'bending_friction': 1.0, 'bending_slip': 0.1}
+    swing = np.sin(np.linspace(0, np.pi, count + 1))[1:, None, None] * np.array(
+        [(0, 0.1, 0), (0, 0.1, 0), (-0.2, 0, 0.1), (-0.2, 0, 0.1)])
+    turns = np.tile(np.eye(3).reshape(9), (count, 4, 1))
+    ropes = {}
+    for name, more in {'plain': {}, 'natural curvature': {'natural_curvature': 2.0}, 'material frame': frame,
+                       'friction between strands': friction, 'all of it': {**frame, **friction}}.items():
+        ropes[name] = CompiledRope(places, points, np.zeros_like(points), {**plain, **more}, 0.003)
+        ropes[name].hold(held)
+    targets = points[held] + swing
+    seconds = side_by_side(benchmark, {name: lambda rope=rope: rope.advance(targets, turns=turns)
+                                       for name, rope in ropes.items()}, 10 * ROUNDS)
+    tables[3].extend([name, f'{1e6 * taken / count:.1f}', f'{taken / seconds["plain"]:.2f}']
+                     for name, taken in seconds.items())
 
 
 class Watch:
