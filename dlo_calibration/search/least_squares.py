@@ -275,7 +275,7 @@ class LeastSquares(PlannedSearch):
                 return here
             if slow > 1 and here.has_rival(rivals):
                 return here
-            if not moved and here.moves:
+            if not moved and (here.moves or not here.jacobian_is_fresh):
                 yield from self._measure(here, np.flatnonzero(here.visible()))
         here.ended = f'stopped after {MOST_ITERATIONS} steps'
         return here

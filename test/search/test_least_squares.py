@@ -126,3 +126,21 @@ def test_two_starts_that_share_an_estimate_and_end_alike_do_not_hide_a_better_pl
         search.tell([Observation(e.point, e.score, e.residuals)
                      for e in (evaluator.evaluate(0, point) for point in points)])
     assert evaluator.evaluate(0, search.best).errors.mean < 2e-3
+
+
+def test_a_minimum_beyond_a_ridge_is_not_descended_with_the_slope_from_this_side():
+    lean, side, scatter = np.random.default_rng(4).normal(size=(3, 60))
+
+    def residuals_at(point):
+        x, y = point
+        beyond = 1 / (1 + np.exp(-(y - 0.5) / 0.03))  # there, x has the opposite effect
+        return 0.1 * lean * ((x - 0.3) * (1 - 2 * beyond) + 0.08 * beyond) + 0.01 * side * (1 - beyond) + \
+            0.01 * scatter * (y - 0.2) * (1 - beyond) + 2e-4 * np.random.default_rng(5).normal(size=60)
+
+    start = Hints(np.array([0.3, 0.1]), np.ones(2, bool))
+    counts = []
+    for seed in (0, 1, 3):
+        search, asked = solve(residuals_at, seed, dimension=2, hints=start)
+        assert search.best[0] == pytest.approx(0.38, abs=0.003)
+        counts.append(len(asked))
+    assert sum(counts) < 170
