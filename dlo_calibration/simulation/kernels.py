@@ -52,7 +52,7 @@ FASTEST_PUSH_OUT = 0.8  # m/s; limits that correction, so that it does not throw
 SUPPORTED = 0.5  # cosine between a push and the opposing support from which on the node is supported
 UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
 WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
-SKIN = 0.004  # m; pairs within this gap are checked until nodes may have moved this far
+SKIN = 0.008  # m; pairs within this gap are checked until nodes may have moved this far
 
 BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
 
@@ -821,29 +821,39 @@ def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
 @_part
 def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
     """
-    Write to `contact.pairs` the pairs of segments that can touch and whose gap may be below `reach` [m].
+    Write to `contact.pairs` the pairs of segments that can touch and whose gap is below `reach` [m].
+
+    The distance of a segment's middle from another changes along the DLO by no more than the way along it, so
+    that of segments far away only some must be looked at.
 
     :param stretch: largest length of a segment, relative to its rest length.
     :returns: the number of pairs.
     """
     half, middles, pairs, diameter = contact.half, contact.middles, contact.pairs, contact.diameter
-    apart, count, segments = contact.apart, 0, len(half)
+    apart, count, segments, longest = contact.apart, 0, len(half), 0.0
     x, y, z = np.empty(segments), np.empty(segments), np.empty(segments)
     for i in range(segments):
         x[i] = (points[i, 0] + points[i + 1, 0]) / 2
         y[i] = (points[i, 1] + points[i + 1, 1]) / 2
         z[i] = (points[i, 2] + points[i + 1, 2]) / 2
+        longest = max(longest, half[i])
+    longest *= 2 * stretch
     for i in range(segments):
-        first = i + 1
-        while first < segments and middles[first] - middles[i] - half[first] - half[i] <= apart:
-            first += 1
-        for j in range(first, segments):
+        j = i + 1
+        while j < segments and middles[j] - middles[i] - half[j] - half[i] <= apart:
+            j += 1
+        far = stretch * (half[i] + diameter) + longest / 2 + reach
+        while j < segments:
             dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
-            far = stretch * (half[i] + half[j] + diameter) + reach
-            if dx * dx + dy * dy + dz * dz <= far * far:
+            beyond = math.sqrt(dx * dx + dy * dy + dz * dz) - far
+            if beyond > 0.0:
+                j += 1 + int(beyond / longest)
+                continue
+            if _closest(points, i, j)[5] <= stretch * diameter + reach:
                 pairs[count, 0] = i
                 pairs[count, 1] = j
                 count += 1
+            j += 1
     return count
 
 
@@ -973,9 +983,17 @@ def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities:
 @_part
 def _travel(velocities: Matrix, step: float) -> float:
     """Return an upper bound [m] of how far two nodes approach each other in a step."""
-    fastest = 0.0
-    for i in range(len(velocities)):
-        fastest = max(fastest, velocities[i, 0]**2 + velocities[i, 1]**2 + velocities[i, 2]**2)
+    n = len(velocities)
+    mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
+    for i in range(n):
+        mean_x += velocities[i, 0]
+        mean_y += velocities[i, 1]
+        mean_z += velocities[i, 2]
+    mean_x, mean_y, mean_z = mean_x / n, mean_y / n, mean_z / n
+    fastest = 0.0  # beside the common motion
+    for i in range(n):
+        x, y, z = velocities[i, 0] - mean_x, velocities[i, 1] - mean_y, velocities[i, 2] - mean_z
+        fastest = max(fastest, x * x + y * y + z * z)
     return 2 * step * math.sqrt(fastest)
 
 
