@@ -38,7 +38,6 @@ from dlo_calibration.observation.clamps import clamp_twist, clamps
 from dlo_calibration.observation.noise import noise
 from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.search.descent import Descent
-from dlo_calibration.search.least_squares import costs_less
 
 STEP = 0.015  # of the finite differences by new parameters, in the unit cube
 REACH = 0.25  # furthest step for which the linear model predicts what new parameters explain
@@ -73,7 +72,9 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     what only fits noise is rejected. Where noise alone explains the residuals, or the linear model shows that
     new parameters would explain too little, nothing is tried. The search for more is least squares, from the
     optimum of less. All evaluations count in the budget, and `Fit.evaluations` contains those of rejected
-    spaces, too.
+    spaces, too. The search in the chosen space is not carried further: among many parameters that the
+    trials hardly determine, the last percent of the cost is noise that the fit would learn (early stopping:
+    Prechelt, Automatic Early Stopping Using Cross Validation, 1998).
 
     :param uniform: the fit of the uniform DLO.
     :param budget: largest number of evaluations of all searches, including those of `uniform`.
@@ -92,7 +93,6 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     why = ladder.climb([(count, _parts(count)) for count in counts])
     parts = ladder.best.fit.space.parts
     words.append(f'{parts} part{"s" * (parts > 1)}' + why)
-    ladder.settle()
     return ladder.outcome('; '.join(words))
 
 
@@ -146,19 +146,6 @@ class _Ladder:
                 break
             missed = True
         return why
-
-    def settle(self) -> None:
-        """Let the search converge in the best space: the searches of the rungs were coarse."""
-        fit, model = self.best.fit, self.best.model
-        if self._budget - self._taken < 1 or fit is self._tried[0]:
-            return
-        try:
-            found = self._searched(fit.space, Hints.at(fit.best.point, model.jacobian))
-        except (CancelledError, SimulationError):
-            return
-        assert fit.best.residuals is not None and found.best.residuals is not None
-        if not costs_less(fit.best.residuals, found.best.residuals):
-            self.best = replace(self.best, fit=found)
 
     def outcome(self, words: str) -> Fit:
         """Return the best fit with all evaluations, in its space."""

@@ -20,23 +20,22 @@ from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.parameters import REST_SHAPE
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
 
 
-def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
+def examined(setting: Setting, fit: Fit) -> Fit:
     """
     Return a fit with the examination of its surroundings, and with the evaluation to report as its best.
 
     A parameter that no trial shows gets its default instead of a random value, unless the fit becomes
     significantly worse. If the user stops, there is no examination.
-
-    :param thorough: False: only what cross-validation needs; the intervals may be wrong.
     """
     if fit.stopped:
         return replace(fit, examination=None)
     try:
-        examination, best = _examined(setting, fit, thorough)
+        examination, best = _examined(setting, fit)
     except CancelledError:
         return replace(fit, examination=None, stopped=True)
     count = examination.evaluations + fit.examined
@@ -45,7 +44,7 @@ def examined(setting: Setting, fit: Fit, thorough: bool = True) -> Fit:
                    examination=replace(examination, evaluations=count, band=band))
 
 
-def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, Evaluation]:
+def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     """
     Return the examination, and the evaluation to report as the best.
 
@@ -54,8 +53,8 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
     trials, space, best = setting.trials, fit.space, fit.best
     assert best.residuals is not None
     default, sigma = space.default_point(), noise(trials)
-    finer = setting.simulator.refined() if thorough else None
-    noisy = thorough and sigma > NO_NOISE and 'length_scale' not in space.free
+    finer = setting.simulator.refined()
+    noisy = sigma > NO_NOISE and 'length_scale' not in space.free
     evaluate = setting.evaluate(space)
     try:
         examination = examine(
@@ -63,7 +62,8 @@ def _examined(setting: Setting, fit: Fit, thorough: bool) -> tuple[Examination, 
             default=default, noise=sigma,
             finer=None if finer is None else setting.evaluate(space, finer=finer).residuals,
             starts=[setting.evaluate(space, others).residuals
-                    for others in _other_starts(trials, sigma)] if noisy else [], thorough=thorough)
+                    for others in _other_starts(trials, sigma)] if noisy else [],
+            fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:
             finer.close()

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.evaluation.linearisation import both_sides, Linearisation, slope, STEP, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
@@ -75,7 +76,7 @@ class Examination:
 
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
             default: Floats, noise: float, finer: Evaluate | None = None,
-            starts: Sequence[Evaluate] = (), thorough: bool = True) -> Examination:
+            starts: Sequence[Evaluate] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
     """
     Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
 
@@ -84,7 +85,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param noise: noise level, see `Examination` [m].
     :param finer: simulates with more nodes and a smaller step; None: this is left out.
     :param starts: each simulates with initial chains of other noise; may be empty.
-    :param thorough: False: only what cross-validation needs; the intervals may be wrong.
+    :param fading: (d,) False for parameters whose effect does not fade along their scale; None: all may.
     """
     count = 0
 
@@ -94,7 +95,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         return evaluate(points)
 
     at_default, = residuals_at(default[None, :])
-    fit = _linearised(point, residuals, layout, residuals_at, noise, 2 if thorough else 0)
+    fit = _linearised(point, residuals, layout, residuals_at, noise)
     fold_errors = _left_out_errors(fit, layout, residuals_at)
     shift = None
     if finer is not None:  # late, because a worker keeps one simulator at a time
@@ -105,8 +106,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     count += len(drawn)
     found = at_minimum(fit, layout, noise=noise, shift=shift,
                        starts=[one for one in drawn if one is not None])
-    if thorough:
-        found = _extended(fit, found, residuals_at)
+    found = _extended(fit, found, residuals_at, fading)
     assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
@@ -117,7 +117,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
-                noise: float, widenings: int) -> Linearisation:
+                noise: float) -> Linearisation:
     """Return the linearised residuals; the steps for uncertain parameters are their standard deviations."""
     dimension = len(point)
 
@@ -130,7 +130,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
 
     steps = np.full(dimension, STEP)
     jacobian = np.stack(columns(range(dimension), steps), axis=1)
-    for _ in range(widenings):
+    for _ in range(2):
         std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
         wider = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), steps)
         weak = np.flatnonzero(wider > 1.5 * steps).tolist()
@@ -144,7 +144,8 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     return Linearisation(point, residuals, jacobian)
 
 
-def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) -> Uncertainty:
+def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
+              fading: NDArray[np.bool_] | None) -> Uncertainty:
     """
     Return intervals that are extended to where the residuals really change as much as the linear fit says.
 
@@ -156,7 +157,7 @@ def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate) ->
     excited = np.flatnonzero(found.excited)
     needed = DEVIATIONS * found.std * 0.9
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
-              if found.std[k] > SUSPECT and ends[side, k] != limits[side]]
+              if found.std[k] > SUSPECT and ends[side, k] != limits[side] and (fading is None or fading[k])]
     for _ in range(4):
         if not unsure:
             break

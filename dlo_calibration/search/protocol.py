@@ -40,7 +40,7 @@ class Hints:
     :param excited: (d,) False where no trial can show the effect of a parameter.
     :param refines: `start` is the result for a simpler model, so that the search starts only there.
     :param jacobian: (m, d) of the residuals at `start` [m per unit cube], if it is known already.
-    :param coarse: another search will refine the result, so that this one ends where steps gain little.
+    :param coarse: the search ends where a step gains little, before it has quite converged.
     """
 
     start: Floats
