@@ -81,9 +81,13 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     :returns: `uniform` itself where nothing was tried.
     """
     space, trials = uniform.space, setting.trials
-    if uniform.stopped or uniform.model is None or _explained(trials, uniform):
+    if uniform.stopped or _explained(trials, uniform):
         return uniform
-    ladder, words = _Ladder(setting, _Stage(uniform, uniform.model), budget), []
+    try:
+        model = uniform.model or _linearised(setting, uniform)
+    except CancelledError:
+        return uniform
+    ladder, words = _Ladder(setting, _Stage(uniform, model), budget), []
     if _shows_rest_shape(trials, space):
         twist = clamp_twist(trials)
         why = ladder.climb([(knots, _knots(knots, twist)) for knots in KNOTS if knots > space.knots])
@@ -238,6 +242,22 @@ class _Ladder:
             if not unsure:
                 break
         return frozen_array(errors)
+
+
+def _linearised(setting: Setting, fit: Fit) -> Linearisation:
+    """
+    Return the linear model of a fit whose search ended away from all its models.
+
+    :raises CancelledError: when stopped.
+    """
+    point, residuals = fit.best.point, fit.best.residuals
+    assert residuals is not None
+    steps = np.diag(np.where(point > 0.5, -STEP, STEP))
+    jacobian = np.zeros((len(residuals), len(point)))
+    for k, seen in enumerate(setting.evaluate(fit.space).residuals(point + steps)):
+        column = slope((point[k], point[k] + steps[k, k]), (residuals, seen))
+        jacobian[:, k] = 0.0 if column is None else column
+    return Linearisation(point, residuals, jacobian)
 
 
 def _knots(count: int, twist: float) -> Finer:

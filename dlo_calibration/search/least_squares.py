@@ -72,7 +72,7 @@ class LeastSquares(PlannedSearch):
         lowest = self._lowest
         if lowest is None or lowest.residuals is None:
             return None
-        near = [(float(np.abs(one.point - lowest.point).max()), one.jacobian)
+        near = [(float(np.abs(one.point - lowest.point)[one.visible()].max(initial=0.0)), one.jacobian)
                 for one in self._descents if one.origin is not None]
         distance, jacobian = min(near, key=lambda pair: pair[0], default=(np.inf, np.zeros(0)))
         return Linearisation(lowest.point, lowest.residuals, jacobian) if distance <= NEAR else None
