@@ -847,7 +847,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
             dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
             beyond = math.sqrt(dx * dx + dy * dy + dz * dz) - far
             if beyond > 0.0:
-                j += 1 + int(beyond / longest)
+                j += 1 + int(min(beyond / longest, float(segments)))  # points may be infinite
                 continue
             if _closest(points, i, j)[5] <= stretch * diameter + reach:
                 pairs[count, 0] = i

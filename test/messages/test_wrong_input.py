@@ -145,7 +145,7 @@ def test_live_and_replayed_refusals_are_the_same(topics, tmp_path):
 
 PARAMETERS = [
     ('mass', -1.0, 'parameter mass: got -1 kg, expected 0 to 1000 kg; choose a value in that range'),
-    ('evaluations', 0, 'parameter evaluations: got 0, expected 1 to 1e+06; choose a value in that range'),
+    ('evaluations', -1, 'parameter evaluations: got -1, expected 0 to 1e+06; choose a value in that range'),
     ('friction', 100.5, 'parameter friction: got 100.5, expected 0 to 100; choose a value in that range'),
     ('mass', 'heavy', "parameter mass: got 'heavy', expected a number; give it that type"),
     ('search', 'magic', "parameter search: got 'magic', expected one of "),

@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import oracles
@@ -17,6 +17,7 @@ from dlo_calibration import Chain, SimulationError
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace, REST_SHAPE
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
 from dlo_calibration.simulation.nodes import NodeLayout
@@ -42,6 +43,8 @@ def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, s
     rest = generator.uniform(0.01, 0.05, segments)
     points = crumpled(seed, rest, size)
     count = len(points)
+    tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
+    assume((1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 > kernels.HAIRPIN)
     velocities = generator.normal(size=points.shape)
     nodes = np.sort(generator.choice(count, min(held, count - 1), replace=False))
     follow = generator.normal(size=(len(nodes), 3))
