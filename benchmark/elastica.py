@@ -96,7 +96,7 @@ class Elastica:
 def simulated(session: Path, nodes: int) -> tuple[float, float, float]:
     """Return stiffness [N m^2], length divided by the measured one, and root mean square distance [m]."""
     read = read_session(session)
-    options = replace(read.options, calibrate=('flexibility', 'length_scale'))
+    options = replace(read.options, calibrate=('flexibility', 'length_scale'), parts=1)
     evaluator = Evaluator(read.trials, options.space, CompiledSimulator(table=False, nodes=nodes))
     search = LeastSquares(2, 1, Hints.at(np.array([0.55, 0.5])))
     while len(points := search.ask(100)):

@@ -12,6 +12,7 @@ from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.excitation import motions
+from dlo_calibration.search import LeastSquares
 
 #: What `calibrate` auto adds to the paper's parameters.
 IN_MOTION = ('damping', 'internal_damping')
@@ -54,7 +55,8 @@ def choose(trials: Sequence[Trial], options: Options) -> Choice:
 
 def chooses_parts(trials: Sequence[Trial], options: Options) -> bool:
     """Tell whether cross-validation over the trials chooses rest shape and number of parts."""
-    return options.parts == 0 and len(trials) > 1 and 'flexibility' in options.space.free
+    return (options.parts == 0 and options.search == LeastSquares.name and len(trials) > 1
+            and 'flexibility' in options.space.free)
 
 
 def budget(dimension: int) -> int:

@@ -68,8 +68,9 @@ class Options(DeclaredOptions):
         choices=(AUTO, *BY_NAME), of=SEARCH)
     parts: int = declared(
         0, 'number of parts of equal length, each with its own bending stiffness; 0: chosen by '
-        'cross-validation, like the rest shape of a DLO in clamps that resists twist; if flexibility is '
-        'calibrated, so is the stiffness of every part; a higher part that calibrate names raises the number',
+        'cross-validation, like the rest shape of a DLO in clamps that resists twist (search least_squares; '
+        'others take one part); if flexibility is calibrated, so is the stiffness of every part; a higher '
+        'part that calibrate names raises the number',
         minimum=0, maximum=MOST_PARTS, of=SEARCH)
     search: str = declared('least_squares', 'method that chooses the parameter sets to try',
                            choices=tuple(SEARCHES), of=SEARCH)

@@ -92,6 +92,7 @@ def test_more_parameters_get_more_evaluations():
     assert most(parts=1) == most(calibrate='friction') == most(parts=2) == 150
     assert most(parts=8) > 150
     assert most() > most(parts=8)
+    assert most(search='random') == most(search='cma_es') == 150  # only least squares goes on to parts
 
 
 def test_a_log_serves_the_names_that_auto_stands_for():
