@@ -16,6 +16,7 @@ import math
 from typing import Callable, Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.setting import Setting
@@ -83,8 +84,8 @@ def refine(setting: Setting, uniform: Fit, budget: int) -> Fit:
     space, trials = uniform.space, setting.trials
     if uniform.stopped or _explained(trials, uniform):
         return uniform
-    try:
-        model = uniform.model or _linearised(setting, uniform)
+    try:  # the search may have ended away from all its models
+        model = uniform.model or _linearised(setting, space, uniform.best.point, np.arange(space.dimension))
     except CancelledError:
         return uniform
     ladder, words = _Ladder(setting, _Stage(uniform, model), budget), []
@@ -198,19 +199,11 @@ class _Ladder:
                            for unit in units], axis=1)
         kept = [int(np.flatnonzero((np.abs(nested - unit) < 1e-9).all(axis=1))[0]) for unit in units]
         new = np.setdiff1d(np.arange(space.dimension), kept)
-        steps = np.zeros((1 + len(new), space.dimension))
-        steps[1 + np.arange(len(new)), new] = np.where(start[new] > 0.5, -STEP, STEP)
-        points = start + steps
-        self._simulated += len(points)
-        at_start, *seen = self._setting.evaluate(space).residuals(points)
-        if at_start is None:
-            raise SimulationError('the start of the search diverged')
-        jacobian = np.zeros((len(at_start), space.dimension))
-        for k, there, one in zip(new, points[1:], seen, strict=True):
-            column = slope((start[k], there[k]), (at_start, one))
-            jacobian[:, k] = 0.0 if column is None else column
+        self._simulated += 1 + len(new)
+        model = _linearised(self._setting, space, start, new)
+        jacobian = model.jacobian.copy()
         jacobian[:, kept] = coarse.model.jacobian - jacobian[:, new] @ nested[new]
-        return Linearisation(start, at_start, jacobian)
+        return replace(model, jacobian=jacobian)
 
     def _left_out(self, space: ParameterSpace, model: Linearisation) -> Floats:
         """
@@ -244,20 +237,24 @@ class _Ladder:
         return frozen_array(errors)
 
 
-def _linearised(setting: Setting, fit: Fit) -> Linearisation:
+def _linearised(setting: Setting, space: ParameterSpace, point: Floats, columns: NDArray[np.intp]
+                ) -> Linearisation:
     """
-    Return the linear model of a fit whose search ended away from all its models.
+    Return the linear model at a (d,) point; derivatives by parameters that are not in `columns` are 0.
 
+    :raises SimulationError: if the point cannot be simulated.
     :raises CancelledError: when stopped.
     """
-    point, residuals = fit.best.point, fit.best.residuals
-    assert residuals is not None
-    steps = np.diag(np.where(point > 0.5, -STEP, STEP))
-    jacobian = np.zeros((len(residuals), len(point)))
-    for k, seen in enumerate(setting.evaluate(fit.space).residuals(point + steps)):
-        column = slope((point[k], point[k] + steps[k, k]), (residuals, seen))
+    points = np.tile(point, (1 + len(columns), 1))
+    points[1 + np.arange(len(columns)), columns] += np.where(point[columns] > 0.5, -STEP, STEP)
+    here, *seen = setting.evaluate(space).residuals(points)
+    if here is None:
+        raise SimulationError('the start of the search diverged')
+    jacobian = np.zeros((len(here), len(point)))
+    for k, there, one in zip(columns, points[1:], seen, strict=True):
+        column = slope((point[k], there[k]), (here, one))
         jacobian[:, k] = 0.0 if column is None else column
-    return Linearisation(point, residuals, jacobian)
+    return Linearisation(np.asarray(point), here, jacobian)
 
 
 def _knots(count: int, twist: float) -> Finer:

@@ -497,8 +497,9 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
             next_diagonal, next_right = stiffness + curved, -torque - slope
             diagonal += next_diagonal
             right += torque - slope
-        if diagonal < 1e-6 * twisting[i - 1]:
-            diagonal = twisting[i - 1]
+        beside = twisting[max(i - 1, 0)]
+        if diagonal < 1e-6 * beside:
+            diagonal = beside
         upper = coupling
         if s < len(clamped) and clamped[s, 0] == i:
             if begun or math.isfinite(clamps[s, 0]):
@@ -823,8 +824,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
     """
     Write to `contact.pairs` the pairs of segments that can touch and whose gap is below `reach` [m].
 
-    The distance of a segment's middle from another changes along the DLO by no more than the way along it, so
-    that of segments far away only some must be looked at.
+    From a segment that is far away, the search goes on as far along the DLO as no other can be near.
 
     :param stretch: largest length of a segment, relative to its rest length.
     :returns: the number of pairs.
