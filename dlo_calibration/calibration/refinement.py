@@ -166,8 +166,7 @@ class _Ladder:
     def _searched(self, space: ParameterSpace, hints: Hints) -> Fit:
         taken = self._taken
         search = LeastSquares(space.dimension, 0, hints)
-        budget = self._budget - taken
-        budget = min(budget, MOST_COARSE * space.dimension) if hints.coarse else budget
+        budget = min(self._budget - taken, MOST_COARSE * space.dimension)
         found = fit(self._setting, space, search, budget, first=taken)
         self._tried.append(found)
         if found.stopped:
@@ -210,8 +209,8 @@ class _Ladder:
         Return the mean point error [m] of each fold of the cross-validation.
 
         Each is predicted near the optimum of the others, after a Gauss-Newton step with a prior: without it,
-        combinations of parameters that the trials hardly determine would move far. The step is halved until
-        the others really fit better.
+        combinations of parameters that the trials hardly determine would move far. The step is halved, twice
+        at most, until the others really fit better; where they never do, the error is that of the fit itself.
         """
         layout, loss, evaluate = self._layout, Huber.of(model.residuals), self._setting.evaluate(space)
         scale = loss.deviation(model.residuals, space.dimension) * math.sqrt(
