@@ -29,7 +29,6 @@ class Setting:
     The trials, options, engine and callbacks that all stages of a calibration share.
 
     :param trials: to calibrate on, at least one; those with the same points get the same rest arc lengths.
-    :param trials: to calibrate on, at least one.
     :param options: those that are open are decided from the trials.
     :param simulator: the engine, which belongs to this thread.
     :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
