@@ -58,8 +58,8 @@ def write_files(folder: Path, source: Source, result: CalibrationResult, make_si
         origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
                         digests([*_recorded(source.path), *repeatable]),
                         [*source.session.problems, *source.refusals])
-        slices = sliced(result, source.options, make_simulator, should_stop)
-        write_report(folder / REPORT, result, origin, slices)
+        write_report(folder / REPORT, result, origin,
+                     lambda: sliced(result, source.options, make_simulator, should_stop))
     return attempts
 
 

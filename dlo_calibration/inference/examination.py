@@ -85,7 +85,8 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param noise: noise level, see `Examination` [m].
     :param finer: simulates with more nodes and a smaller step; None: this is left out.
     :param starts: each simulates with initial chains of other noise; may be empty.
-    :param fading: (d,) False for parameters whose effect does not fade along their scale; None: all may.
+    :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
+        fade or have kinks.
     """
     count = 0
 
@@ -95,7 +96,8 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         return evaluate(points)
 
     at_default, = residuals_at(default[None, :])
-    fit = _linearised(point, residuals, layout, residuals_at, noise)
+    fading = np.ones(len(point), bool) if fading is None else fading
+    fit = _linearised(point, residuals, layout, residuals_at, noise, fading)
     fold_errors = _left_out_errors(fit, layout, residuals_at)
     shift = None
     if finer is not None:  # late, because a worker keeps one simulator at a time
@@ -117,8 +119,8 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
-                noise: float) -> Linearisation:
-    """Return the linearised residuals; the steps for uncertain parameters are their standard deviations."""
+                noise: float, fading: NDArray[np.bool_]) -> Linearisation:
+    """Return the linearised residuals; uncertain parameters take steps of their standard deviations."""
     dimension = len(point)
 
     def columns(wanted: Sequence[int], steps: Floats) -> list[Floats]:
@@ -133,7 +135,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     for _ in range(2):
         std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
         wider = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), steps)
-        weak = np.flatnonzero(wider > 1.5 * steps).tolist()
+        weak = np.flatnonzero(fading & (wider > 1.5 * steps)).tolist()
         if not weak:
             break
         steps[weak] = wider[weak]
@@ -145,7 +147,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
 
 
 def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
-              fading: NDArray[np.bool_] | None) -> Uncertainty:
+              fading: NDArray[np.bool_]) -> Uncertainty:
     """
     Return intervals that are extended to where the residuals really change as much as the linear fit says.
 
@@ -157,7 +159,7 @@ def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
     excited = np.flatnonzero(found.excited)
     needed = DEVIATIONS * found.std * 0.9
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
-              if found.std[k] > SUSPECT and ends[side, k] != limits[side] and (fading is None or fading[k])]
+              if found.std[k] > SUSPECT and ends[side, k] != limits[side] and fading[k]]
     for _ in range(4):
         if not unsure:
             break

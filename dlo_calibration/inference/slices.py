@@ -103,8 +103,8 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
 
 
 def seconds_for(calibration: float) -> float:
-    """Return the time limit of the slices [s]: a fifth of that of the calibration [s], but 5 to 10 s."""
-    return min(max(5.0, 0.2 * calibration), 10.0)
+    """Return the time limit of the slices [s]: a fifth of that of the calibration [s], but 5 to 8 s."""
+    return min(max(5.0, 0.2 * calibration), 8.0)
 
 
 def chosen(names: Sequence[str], std: Floats) -> list[int]:

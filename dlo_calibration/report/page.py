@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
@@ -12,7 +13,7 @@ from itertools import combinations
 from pathlib import Path
 import platform
 import shlex
-from typing import Any, Iterable, Mapping, Sequence
+from typing import Any, Callable, Iterable, Mapping, Sequence
 
 from dlo_calibration.calibration.file_options import recordable
 from dlo_calibration.calibration.options import declarations, Options
@@ -74,14 +75,22 @@ def digests(paths: Iterable[Path]) -> dict[str, str]:
     return found
 
 
-def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: Slices | None = None) -> None:
+def write_report(path: Path, result: CalibrationResult, origin: Origin,
+                 simulate_slices: Callable[[], Slices | None] = lambda: None) -> None:
     """
     Write the page as one file, which needs no other file and no network.
 
-    :param slices: through the found values; None: the page has none.
+    :param simulate_slices: returns slices through the found values, None: the page has none; called in a
+        thread of its own, while this one draws the other pictures.
     :raises InputError: if the file cannot be written.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    with ThreadPoolExecutor(1) as thread:
+        pending = thread.submit(simulate_slices)
+        drawn = {'rest_shapes': rest_shape_panels(result), 'moments': moment_panels(result),
+                 'convergence': convergence_panel(result), **_trials(result)}
+        slices = pending.result()
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
                               autoescape=True, trim_blocks=True, lstrip_blocks=True,
@@ -94,11 +103,9 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin, slices: 
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
         rows=parameter_rows(values['parameters'], result.space),
         correlated=most_correlated(values['correlations']),
-        rest_shapes=rest_shape_panels(result), moments=moment_panels(result),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
-        **_trials(result), convergence=convergence_panel(result),
-        lowest_score=min(one.score for one in result.evaluations),
+        **drawn, lowest_score=min(one.score for one in result.evaluations),
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
         versions={name: _version(name) for name in

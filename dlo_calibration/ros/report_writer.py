@@ -23,7 +23,7 @@ class ReportWriter:
     """
     Writes pages; it collects errors instead of raising them.
 
-    :param make_simulator: called in the thread, for the slices.
+    :param make_simulator: called in a thread of its own, for the slices.
     """
 
     def __init__(self, make_simulator: SimulatorFactory) -> None:
@@ -55,7 +55,7 @@ class ReportWriter:
 
     def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
         try:
-            slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
-            write_report(path, result, origin, slices)
+            write_report(path, result, origin,
+                         lambda: sliced(result, origin.options, self._make_simulator, self._stop.is_set))
         except Exception as error:  # the user must learn why there is no page
             self._failures.put((path, reason(error)))

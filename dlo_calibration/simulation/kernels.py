@@ -53,6 +53,7 @@ SUPPORTED = 0.5  # cosine between a push and the opposing support from which on 
 UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
 WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
 SKIN = 0.008  # m; pairs within this gap are checked until nodes may have moved this far
+FAST = 0.001  # m; where nodes move further in a step, it is first asked whether all are clear of each other
 
 BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
 
@@ -65,13 +66,10 @@ def _record(record: Any) -> Any:
     return record
 
 
-# Numba counts references to all arrays of a record that is passed, and to each field that is read.  So
-# kernels read fields before a loop, and pass few records in each step.
-
-
 def _part(kernel: Kernel) -> Kernel:
     """Compile a function together with the kernels that call it."""
-    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy')
+    options: dict[str, Any] = {'_nrt': False}  # parts make no arrays: references to them need not be counted
+    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
@@ -217,6 +215,9 @@ class SelfContact(NamedTuple):
     :param room: (1,) [m] how far nodes may move until pairs must be searched again; negative: search now.
     :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
     :param change: (S + 1, 3) workspace.
+    :param motion: (7, S) workspace.
+    :param overlaps: (1,) 1 if some of `distances` may be below the diameter.
+    :param next_one: how many segments further the first one is that a segment can touch.
     """
 
     half: Vector
@@ -230,6 +231,9 @@ class SelfContact(NamedTuple):
     room: Vector
     contacts: Contacts
     change: Matrix
+    motion: Matrix
+    overlaps: Indices
+    next_one: int
 
 
 @_record
@@ -831,7 +835,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
     """
     half, middles, pairs, diameter = contact.half, contact.middles, contact.pairs, contact.diameter
     apart, count, segments, longest = contact.apart, 0, len(half), 0.0
-    x, y, z = np.empty(segments), np.empty(segments), np.empty(segments)
+    x, y, z = contact.motion[0], contact.motion[1], contact.motion[2]
     for i in range(segments):
         x[i] = (points[i, 0] + points[i + 1, 0]) / 2
         y[i] = (points[i, 1] + points[i + 1, 1]) / 2
@@ -862,9 +866,11 @@ def start_distances(contact: SelfContact, points: Matrix) -> None:
     """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
     distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
     distances[:] = diameter
+    contact.overlaps[0] = 0
     for k in range(near_pairs(contact, points, 1.0, 0.0)):
         i, j = pairs[k, 0], pairs[k, 1]
         distances[i, j] = min(diameter, _closest(points, i, j)[5])
+        contact.overlaps[0] = 1
     contact.room[0] = -1.0
 
 
@@ -1005,6 +1011,40 @@ def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> b
 
 
 @_part
+def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step: float) -> bool:
+    """
+    Tell whether surely no two segments touch each other within a step; see `keep_apart`.
+
+    Their middles are further apart than a diameter, half of each segment, and the way of both together. All
+    pairs are checked: it takes less time than a search that branches.
+    """
+    diameter, motion, segments = contact.diameter, contact.motion, len(contact.half)
+    x, y, z, u, v, w, size = motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6]
+    for i in range(segments):
+        length, change = 0.0, 0.0
+        for c in range(3):
+            motion[c, i] = (points[i, c] + points[i + 1, c]) / 2
+            motion[3 + c, i] = step * (velocities[i, c] + velocities[i + 1, c]) / 2
+            length += (points[i + 1, c] - points[i, c])**2
+            change += (velocities[i + 1, c] - velocities[i, c])**2
+        size[i] = (diameter + math.sqrt(length) + step * math.sqrt(change)) / 2
+    for away in range(contact.next_one, segments):
+        doubtful = 0
+        # Slices, and no branch in the loop: the compiler makes four steps at once of it.
+        x_there, y_there, z_there, size_there = x[away:], y[away:], z[away:], size[away:]
+        u_there, v_there, w_there = u[away:], v[away:], w[away:]
+        for i in range(segments - away):
+            a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
+            d, e, f = u_there[i] - u[i], v_there[i] - v[i], w_there[i] - w[i]
+            most = size_there[i] + size[i]
+            # (p + q)^2 <= 1.2 p^2 + 6 q^2
+            doubtful += not a * a + b * b + c * c > 1.2 * most * most + 6.0 * (d * d + e * e + f * f)
+        if doubtful > 0:
+            return False
+    return True
+
+
+@_part
 def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector,
                support: Matrix, step: float) -> None:
     """
@@ -1020,8 +1060,15 @@ def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse
     :param step: time step [s].
     """
     near = contact.near
-    if contact.room[0] < 0:  # a segment may be stretched by 20 %
-        near[0] = near_pairs(contact, points, 1.2, _travel(velocities, step) + SKIN)
+    if contact.room[0] < 0:
+        way = _travel(velocities, step)
+        if way > FAST and _stays_clear(contact, points, velocities, step):
+            near[0] = 0
+            if contact.overlaps[0] == 1:
+                contact.distances[:] = contact.diameter
+                contact.overlaps[0] = 0
+            return
+        near[0] = near_pairs(contact, points, 1.2, way + SKIN)  # a segment may be stretched by 20 %
         contact.room[0] = SKIN
     count = _find_contacts(contact, near[0], points, velocities, step)
     if count == 0:

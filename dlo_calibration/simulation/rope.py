@@ -90,14 +90,17 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
     :param friction: Coulomb coefficient.
     """
     segments, half = len(rest_lengths), rest_lengths / 2
-    count = segments * (segments - 1) // 2
+    count, middles = segments * (segments - 1) // 2, rest_lengths.cumsum() - half
+    apart = max(np.pi * radius, float(half.max()))
+    gaps = np.subtract.outer(middles - half, middles + half)  # [j, i]: arc length between two segments
+    beyond = np.subtract(*np.nonzero(gaps > apart))
     return kernels.SelfContact(
-        half=half, middles=rest_lengths.cumsum() - half, diameter=2.0 * radius,
-        apart=max(np.pi * radius, float(half.max())), friction=float(friction),
+        half=half, middles=middles, diameter=2.0 * radius, apart=apart, friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
         near=np.zeros(1, np.int64), room=np.full(1, -1.0),
         contacts=np.empty(count, kernels.CONTACT),
-        change=np.empty((segments + 1, 3)))
+        change=np.empty((segments + 1, 3)), motion=np.empty((7, segments)),
+        overlaps=np.zeros(1, np.int64), next_one=int(beyond.min(initial=segments)))
 
 
 def diverged() -> SimulationError:

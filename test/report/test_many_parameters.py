@@ -142,7 +142,7 @@ def test_the_page_stays_small(result, tmp_path, without_drawings):
     evaluator = Evaluator(result.trials, result.space, ToySimulator())
     slices = simulate_slices(evaluator, result.best, result.std, result.examination, seconds=60)
     assert len(slices.lines) == MOST_LINES and slices.complete
-    write_report(tmp_path / 'page.html', result, Origin('s', 'a command', Options()), slices)
+    write_report(tmp_path / 'page.html', result, Origin('s', 'a command', Options()), lambda: slices)
     page = (tmp_path / 'page.html').read_text(encoding='utf-8')
     assert 'rest_curvature 9' in page and 'The shape when nothing bends it' in page
     assert 'The bend that it keeps' in page

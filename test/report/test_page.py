@@ -58,7 +58,7 @@ def slices(result):
 def written(folder, result, origin=None, slices=None):
     """Write the page of a result and return its text."""
     path = folder / 'report.html'
-    write_report(path, result, origin or Origin('s', 'a command', OPTIONS), slices)
+    write_report(path, result, origin or Origin('s', 'a command', OPTIONS), lambda: slices)
     return path.read_text(encoding='utf-8')
 
 
