@@ -215,7 +215,7 @@ class SelfContact(NamedTuple):
     :param room: (1,) [m] how far nodes may move until pairs must be searched again; negative: search now.
     :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
     :param change: (S + 1, 3) workspace.
-    :param motion: (7, S) workspace.
+    :param motion: (14, S) workspace.
     :param overlaps: (1,) 1 if some of `distances` may be below the diameter.
     :param next_one: how many segments further the first one is that a segment can touch.
     """
@@ -1011,37 +1011,56 @@ def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> b
 
 
 @_part
+def _are_clear(balls: Matrix, count: int, first: int, last: int) -> bool:
+    """
+    Tell whether balls do not meet in a step, each with those that are `first` to `last` further.
+
+    :param balls: (7, n) [m] centres, motion of the centres in the step, and radii; the first `count` columns.
+    """
+    x, y, z, u, v, w, radius = balls[0], balls[1], balls[2], balls[3], balls[4], balls[5], balls[6]
+    for away in range(first, min(last + 1, count)):
+        met = 0
+        # Slices, and no branch in the loop: the compiler makes four steps at once of it.
+        x_there, y_there, z_there, radius_there = x[away:], y[away:], z[away:], radius[away:]
+        u_there, v_there, w_there = u[away:], v[away:], w[away:]
+        for i in range(count - away):
+            a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
+            d, e, f = u_there[i] - u[i], v_there[i] - v[i], w_there[i] - w[i]
+            both = radius_there[i] + radius[i]
+            # (p + q)^2 <= 1.2 p^2 + 6 q^2
+            met += not a * a + b * b + c * c > 1.2 * both * both + 6.0 * (d * d + e * e + f * f)
+        if met > 0:
+            return False
+    return True
+
+
+@_part
 def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step: float) -> bool:
     """
     Tell whether surely no two segments touch each other within a step; see `keep_apart`.
 
-    Their middles are further apart than a diameter, half of each segment, and the way of both together. All
-    pairs are checked: it takes less time than a search that branches.
+    All pairs are checked, which takes less time than a search that branches: near ones by balls around
+    segments, the others by balls around two segments.
     """
-    diameter, motion, segments = contact.diameter, contact.motion, len(contact.half)
-    x, y, z, u, v, w, size = motion[0], motion[1], motion[2], motion[3], motion[4], motion[5], motion[6]
+    diameter, segments, next_one = contact.diameter, len(contact.half), contact.next_one
+    single, double = contact.motion[:7], contact.motion[7:]
     for i in range(segments):
         length, change = 0.0, 0.0
         for c in range(3):
-            motion[c, i] = (points[i, c] + points[i + 1, c]) / 2
-            motion[3 + c, i] = step * (velocities[i, c] + velocities[i + 1, c]) / 2
+            single[c, i] = (points[i, c] + points[i + 1, c]) / 2
+            single[3 + c, i] = step * (velocities[i, c] + velocities[i + 1, c]) / 2
             length += (points[i + 1, c] - points[i, c])**2
             change += (velocities[i + 1, c] - velocities[i, c])**2
-        size[i] = (diameter + math.sqrt(length) + step * math.sqrt(change)) / 2
-    for away in range(contact.next_one, segments):
-        doubtful = 0
-        # Slices, and no branch in the loop: the compiler makes four steps at once of it.
-        x_there, y_there, z_there, size_there = x[away:], y[away:], z[away:], size[away:]
-        u_there, v_there, w_there = u[away:], v[away:], w[away:]
-        for i in range(segments - away):
-            a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
-            d, e, f = u_there[i] - u[i], v_there[i] - v[i], w_there[i] - w[i]
-            most = size_there[i] + size[i]
-            # (p + q)^2 <= 1.2 p^2 + 6 q^2
-            doubtful += not a * a + b * b + c * c > 1.2 * most * most + 6.0 * (d * d + e * e + f * f)
-        if doubtful > 0:
-            return False
-    return True
+        single[6, i] = (diameter + math.sqrt(length) + step * math.sqrt(change)) / 2
+    if not _are_clear(single, segments, next_one, 3):
+        return False
+    count = (segments + 1) // 2
+    for k in range(count):
+        i = 2 * k + 1
+        for c in range(3):
+            double[c, k], double[3 + c, k] = points[i, c], step * velocities[i, c]
+        double[6, k] = 2 * max(single[6, i - 1], single[6, min(i, segments - 1)]) - diameter / 2
+    return _are_clear(double, count, max(2, next_one // 2), count)
 
 
 @_part

@@ -206,6 +206,25 @@ def test_a_penetration_is_pushed_out_gently():
     assert fastest < 0.6
 
 
+@given(st.integers(0, 2**32 - 1), st.sampled_from([6, 11, 20, 41]), st.sampled_from([0.001, 0.004, 0.02]),
+       st.sampled_from([0.5, 3.0, 20.0]), st.floats(0.0, 1.0))
+def test_no_contact_of_a_fast_dlo_is_missed(seed, nodes, radius, speed, curl):
+    """What is left out because all is clear is what a check of every pair would not find either."""
+    generator = np.random.default_rng(seed)
+    directions = np.cumsum(curl * generator.normal(0, 1, (nodes - 1, 3)), axis=0) + (1.0, 0, 0)
+    steps = 0.03 * directions / np.linalg.norm(directions, axis=1)[:, None]
+    points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    velocities = speed * np.cumsum(generator.normal(0, 0.2, points.shape), axis=0)
+    places = 0.03 * np.arange(nodes)
+    usual, thorough = (Touching(places, radius, 0.3, STEP) for _ in range(2))
+    for touching in (usual, thorough):
+        touching.start(points)
+    thorough.check_every_pair(points)
+    allowed = [touching.velocities(points, velocities, masses(nodes), 0 * points)
+               for touching in (usual, thorough)]
+    assert np.array_equal(*allowed)
+
+
 def test_a_new_start_forgets_the_last():
     overlapping, places = strands(0.004)
     apart, _ = strands(0.02)
