@@ -26,7 +26,7 @@ from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
 from dlo_calibration.inference.missing_parameters import missing_parameters
-from dlo_calibration.inference.slices import seconds_for, simulate_slices, Slices
+from dlo_calibration.inference.slices import simulate_slices, Slices
 from dlo_calibration.simulation.protocol import Simulator
 
 STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop, which users wait for
@@ -143,6 +143,6 @@ def sliced(result: CalibrationResult, options: Options, make_simulator: Simulato
     try:
         with closing(make_simulator(options)) as simulator:
             return simulate_slices(Evaluator(result.trials, result.space, simulator), result.best, result.std,
-                       result.examination, seconds=seconds_for(result.seconds), should_stop=should_stop)
+                                   result.examination, should_stop=should_stop)
     except Exception:  # the page is written even if the engine fails
         return None

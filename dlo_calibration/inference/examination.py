@@ -13,6 +13,7 @@ The module `uncertainty` computes the intervals from them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Callable, Sequence
 
 import numpy as np
@@ -124,10 +125,13 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     dimension = len(point)
 
     def columns(wanted: Sequence[int], steps: Floats) -> list[Floats]:
-        beside = both_sides(point, wanted, steps)
-        seen = residuals_at(beside)
-        found = [slope((point[k], *beside[2 * j:2 * j + 2, k]), (residuals, *seen[2 * j:2 * j + 2]))
-                 for j, k in enumerate(wanted)]
+        sides = [both_sides(point, [k], steps) for k in wanted]
+        # One side, the one towards the middle, shows an effect that is much the same along the scale.
+        beside = [both if fading[k] else both[[int(point[k] < 0.5)]]
+                  for k, both in zip(wanted, sides, strict=True)]
+        seen = iter(residuals_at(np.concatenate(beside)))
+        found = [slope((point[k], *one[:, k]), (residuals, *islice(seen, len(one))))
+                 for k, one in zip(wanted, beside, strict=True)]
         return [np.zeros_like(residuals) if one is None else one for one in found]
 
     steps = np.full(dimension, STEP)

@@ -21,6 +21,7 @@ from dlo_calibration.model.parameters import PAPER_PARAMETERS, SCALE
 
 LEVELS = (4, 8, 16)  # intervals of a line, coarse first: each level uses the points of the one before
 NARROWEST = 10.0  # a slice extends at least this far to each side (0..100)
+MOST_SECONDS = 6.0  # for all slices, which the page waits for
 MOST_LINES = 6  # more parameters would take too long to simulate, and to look at
 
 
@@ -75,7 +76,7 @@ class Slices:
 
 
 def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examination: Examination | None, *,
-        seconds: float, should_stop: Callable[[], bool] = lambda: False,
+        seconds: float = MOST_SECONDS, should_stop: Callable[[], bool] = lambda: False,
         clock: Callable[[], float] = time.monotonic) -> Slices:
     """
     Simulate slices around the found values, coarse ones first, until the time is up.
@@ -100,11 +101,6 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     except CancelledError:
         return Slices(lines, planes, grid.count, False)
     return Slices(lines, planes, grid.count, True)
-
-
-def seconds_for(calibration: float) -> float:
-    """Return the time limit of the slices [s]: a fifth of that of the calibration [s], but 5 to 8 s."""
-    return min(max(5.0, 0.2 * calibration), 8.0)
 
 
 def chosen(names: Sequence[str], std: Floats) -> list[int]:
