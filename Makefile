@@ -76,6 +76,7 @@ soak: $(STAMP)
 figures: bench
 	@$(PYTHON) benchmark/searches.py
 	$(PYTHON) benchmark/capture.py
+	$(PYTHON) benchmark/first_day.py
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
 	cp build/experiment/experiment.md benchmark/results/experiment.md
 	$(PYTHON) benchmark/worth.py --output build/experiment >/dev/null

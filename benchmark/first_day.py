@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Play the first day with a robot and a tracker, and print what the user was told, and when.
+
+    python benchmark/first_day.py [--minutes 10] [--output DIR]
+
+The node is a process of its own whose caches and folders are new, so that it has nothing compiled.  A
+tracker sends 30 clouds a second from the beginning to the end: first in a frame 0.75 m above the table, then
+the same with the parameter `frame_pose`.  A hand moves a simulated rope three times, the node calibrates
+twice: after the third trial, and again when the tracker has shown the rope at rest for minutes.  Another
+thread calls a service of the node ten times a second, and measures how long each answer takes.  At last the
+recorded session is calibrated again, with the command line.  The table is written to
+benchmark/results/first_day.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from bisect import bisect_right
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+import rclpy
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.time import Time
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from dlo_calibration import Action, Chain, Goal, Hand, Options, Trial
+from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.model.parameters import ParameterSpace
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / 'examples'))
+from robot_session import action, chain, LATCHED, values  # noqa: E402 - an example shows how to send messages
+
+NODE = '/calibrator'
+RATE = 30.0  # 1/s, of the tracker
+NOISE = 0.0007  # m, of one coordinate that it sees
+LIFTED = 0.75  # m; so far above the table's frame is the frame of tracker and hand
+MASS = 0.03  # kg
+NODES, SEEN = 81, 4  # of the simulated rope; the tracker sees every fourth one
+TRUTH = {'flexibility': 42.0, 'elasticity': 60.0, 'friction': 45.0, 'self_collision': 30.0}
+SWING = 3.0  # s after an action, in which the rope comes to rest
+ACTIONS = (  # place of the grip along the rope, 0..1; way of the hand [m]: up, then aside, then down
+    (0.0, (0.10, 0.20)), (0.5, (0.15, -0.18)), (1.0, (-0.25, 0.12)), (0.25, (0.05, 0.22)))
+
+
+class Rope:
+    """A simulated rope on a table; it remembers where it was at each instant."""
+
+    def __init__(self) -> None:
+        along = np.linspace(-0.5, 0.5, NODES)
+        curve = np.stack([0.6 * along, 0.04 * np.sin(5 * along), 0 * along], axis=1)
+        self.length = Chain(curve).length
+        self.physical = ParameterSpace(mass=MASS).physical(TRUTH, self.length)
+        self.points = curve + (0.0, 0.0, self.physical['self_collision'])
+        options = Options(mass=MASS, nodes=(NODES + 1) // 2, engine='compiled')
+        self.simulator = make_simulator(options).refined()
+        self.times, self.movie = [0.0], [self.points]
+
+    def at(self, now: float) -> np.ndarray:
+        """Return the (n, 3) [m] points that a perfect tracker sees at a time [s]."""
+        return self.movie[max(bisect_right(self.times, now) - 1, 0)][::SEEN]
+
+    def act(self, number: int, now: float) -> tuple[list[tuple[float, np.ndarray]], float]:
+        """Let the hand act from a time [s]; return its waypoints, and how long the rope needs to rest [s]."""
+        place, (x, y) = ACTIONS[number]
+        grip = round(place * (NODES - 1))
+        way = self.points[grip] + np.array([(0, 0, 0), (0, 0, 0.06), (x, y, 0.06), (x, y, 0.0)])
+        times = np.array([0.0, 0.5, 1.7, 2.2])
+        start = Chain(self.points)
+        instants = np.arange(1, round((times[-1] + SWING) * RATE)) / RATE
+        goals = tuple(Goal(start, float(t), stable=False, held_by=('hand',) if t < times[-1] else ())
+                      for t in instants)
+        trial = Trial('the day', start, (Action((Hand('hand', (grip,), times, way),)),), goals)
+        shown = self.simulator.simulate(trial, self.physical).chains
+        self.times += (now + instants).tolist()
+        self.movie += list(shown)
+        self.points = shown[-1]
+        return list(zip(times.tolist(), way, strict=True)), float(times[-1] + SWING)
+
+
+class Day:
+    """Tracker, hand and user: what they send, and what they are told."""
+
+    def __init__(self, minutes: float) -> None:
+        self.rope, self.begun, self.minutes = Rope(), time.monotonic(), minutes
+        self.generator = np.random.default_rng(0)
+        self.told: list[tuple[float, str, str]] = []
+        self.slowest, self.answers, self.heard, self.over = 0.0, 0, {}, False
+        self.node = rclpy.create_node('day')
+        self.initial = self.node.create_publisher(PointCloud2, f'{NODE}/initial_chain', 10)
+        self.goal = self.node.create_publisher(PointCloud2, f'{NODE}/goal_chain', 10)
+        self.hands = self.node.create_publisher(MultiDOFJointTrajectory, f'{NODE}/action', 10)
+        for name in ('status', 'result'):
+            self.node.create_subscription(DiagnosticArray, f'{NODE}/{name}',
+                                          lambda message, name=name: self.hear(name, message), LATCHED)
+        self.node.create_subscription(Log, '/rosout', self.hear_log, 100)
+        self.clients = {name: self.node.create_client(Trigger, f'{NODE}/{name}')
+                        for name in ('start', 'reset')}
+        self.get = self.node.create_client(GetParameters, f'{NODE}/get_parameters')
+        self.set = self.node.create_client(SetParameters, f'{NODE}/set_parameters')
+        self.node.create_timer(1 / RATE, self.track)
+        executor = MultiThreadedExecutor(2)
+        executor.add_node(self.node)
+        threading.Thread(target=executor.spin, daemon=True).start()
+        threading.Thread(target=self.probe, daemon=True).start()
+
+    @property
+    def now(self) -> float:
+        """Seconds since the day began."""
+        return time.monotonic() - self.begun
+
+    def tell(self, who: str, text: str) -> None:
+        """Note what the user was told, or did."""
+        if not self.told or self.told[-1][1:] != (who, text):
+            self.told.append((self.now, who, text))
+            print(f'{self.now:7.1f} s  {who:8} {text}', flush=True)
+
+    def hear(self, name: str, message: DiagnosticArray) -> None:
+        """Note a status or result."""
+        self.heard[name] = message
+        for one in message.status if name == 'result' else message.status[:1]:
+            self.tell(name, f'{one.name}: {one.message}' if name == 'result' else one.message)
+
+    def hear_log(self, message: Log) -> None:
+        """Note a line of the node's log."""
+        if message.name.endswith('calibrator'):
+            self.tell('log', message.msg)
+
+    def seen(self) -> np.ndarray:
+        """Return what the tracker sees now, in its own frame."""
+        points = self.rope.at(self.now)
+        return points + self.generator.normal(0, NOISE, points.shape) + (0.0, 0.0, LIFTED)
+
+    def track(self) -> None:
+        """Publish a cloud."""
+        self.goal.publish(chain(self.seen(), self.node.get_clock().now()))
+
+    def probe(self) -> None:
+        """Call a service again and again; keep the longest wait for an answer."""
+        while not self.get.wait_for_service(0.1):
+            pass
+        while not self.over:
+            begun = time.monotonic()
+            self.call(self.get, GetParameters.Request(names=['mass']))
+            self.slowest, self.answers = max(self.slowest, time.monotonic() - begun), self.answers + 1
+            time.sleep(0.1)
+
+    def call(self, client, request, patience=120.0):
+        """Call a service; return its answer."""
+        future, end = client.call_async(request), time.monotonic() + patience
+        while not future.done():
+            if time.monotonic() > end:
+                raise TimeoutError(f'{client.srv_name} was not answered within {patience:.0f} s')
+            time.sleep(0.002)
+        return future.result()
+
+    def ask(self, name: str) -> float:
+        """Call a request of the node; return when it was sent."""
+        sent = self.now
+        answer = self.call(self.clients[name], Trigger.Request())
+        self.slowest = max(self.slowest, self.now - sent)
+        self.tell('~/' + name, f'answered after {self.now - sent:.2f} s: {answer.message}')
+        return sent
+
+    def move(self, number: int) -> None:
+        """Send the chain before an action, move the rope, and wait until it rests."""
+        self.initial.publish(chain(self.seen(), self.node.get_clock().now()))
+        time.sleep(0.2)
+        begun, stamp = self.now, self.node.get_clock().now()
+        waypoints, rest = self.rope.act(number, begun)
+        self.hands.publish(action([(t, place + (0.0, 0.0, LIFTED)) for t, place in waypoints],
+                                  Time(nanoseconds=stamp.nanoseconds, clock_type=stamp.clock_type)))
+        self.tell('robot', f'action {number + 1}')
+        self.wait(begun + rest)
+
+    def wait(self, until: float) -> None:
+        """Sleep until a time [s] of the day."""
+        time.sleep(max(0.0, until - self.now))
+
+    def result(self, since: float, patience: float = 600.0) -> float:
+        """Wait for the result of a calibration that was asked for at a time [s]; return how long it took."""
+        self.heard.pop('result', None)
+        while 'result' not in self.heard:
+            if self.now - since > patience:
+                raise TimeoutError('no result')
+            time.sleep(0.01)
+        return self.now - since
+
+    def play(self) -> dict[str, float]:
+        """Play the day; return figures."""
+        while not all(one.service_is_ready() for one in (*self.clients.values(), self.set)):
+            time.sleep(0.01)
+        figures = {'services ready after': self.now}
+        self.tell('user', "the node is there; the hand acts, in a frame that is not the table's")
+        self.move(0)
+        self.wait(self.now + 4.0)
+        figures['told about the frame'] = float(any(
+            'frame_pose' in text for _, who, text in self.told if who in ('status', 'log')))
+        self.ask('reset')
+        pose = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=f'0 0 {-LIFTED} 0 0 0 1')
+        answer = self.call(self.set, SetParameters.Request(
+            parameters=[Parameter(name='frame_pose', value=pose)])).results[0]
+        self.tell('user', f'sets frame_pose to {pose.string_value}: '
+                  f'{"done" if answer.successful else answer.reason}')
+        for number in (1, 2, 3):
+            self.move(number)
+            self.wait(self.now + 5.0)
+        figures['from ~/start to the first result'] = self.result(self.ask('start'))
+        self.wait(60 * self.minutes - 90.0)
+        figures['from ~/start to the second result'] = self.result(self.ask('start'))
+        self.wait(60 * self.minutes)
+        self.over = True
+        time.sleep(1.0)
+        figures['longest wait for an answer'] = self.slowest
+        figures['answers'] = self.answers
+        return figures
+
+
+def main() -> None:
+    """Play the day in a new folder."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--minutes', type=float, default=10.0, help='length of the day')
+    parser.add_argument('--output', type=Path, default=None, help='folder of the node')
+    chosen = parser.parse_args()
+    folder = chosen.output or Path(tempfile.mkdtemp(prefix='first_day_'))
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ |= {'ROS_DOMAIN_ID': str(1 + os.getpid() % 100), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                   'ROS_LOG_DIR': str(folder / 'log')}
+    rclpy.init()
+    fresh = {**os.environ, 'NUMBA_CACHE_DIR': str(folder / 'numba'), 'XDG_CACHE_HOME': str(folder / 'cache')}
+    day = Day(chosen.minutes)
+    child = subprocess.Popen([sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args',
+                              '-p', f'mass:={MASS}', '-p', f'output_directory:={folder}'], env=fresh)
+    try:
+        figures = day.play()
+        begun = day.now
+        child.send_signal(signal.SIGINT)
+        figures['exit code of the node'] = child.wait(60)
+        figures['from SIGINT to the end'] = day.now - begun
+    finally:
+        child.kill()
+        child.wait()
+    print_day(day, figures, folder)
+    rclpy.try_shutdown()
+
+
+def print_day(day: Day, figures: dict[str, float], folder: Path) -> None:
+    """Calibrate the recorded session again, and write the table."""
+    session = max(folder.glob('dlo_session_*'), key=lambda path: path.stat().st_mtime)
+    done = subprocess.run([sys.executable, '-m', 'dlo_calibration', 'fit', str(session), '--json'],
+                          check=True, stdout=subprocess.PIPE)
+    replayed = json.loads(done.stdout)
+    result = {one.name: values(day.heard['result'], one.name) for one in day.heard['result'].status}
+    rows = ['| parameter | truth | found by the node | 90 % interval | replayed |', '|---|---|---|---|---|']
+    for name, truth in TRUTH.items():
+        one, again = result[name], replayed['parameters'][name]
+        rows.append(f'| {name} | {truth:.1f} | {float(one["value"]):.4f} '
+                    f'| {float(one["lower"]):.1f} to {float(one["upper"]):.1f} | {again["value"]:.4f} |')
+    lines = [f'| {name} | {value:.4g} |' for name, value in figures.items()]
+    told = [f'{when:7.1f} s  {who:8} {text}' for when, who, text in day.told]
+    text = '\n'.join([
+        '# first day', '',
+        f'`python benchmark/first_day.py --minutes {day.minutes:g}`; times in seconds.', '',
+        '| figure | value |', '|---|---|', *lines, '', *rows, '',
+        f'Mean error of the replay {1e3 * replayed["mean_error_m"]:.2f} mm.', '',
+        'What the user was told:', '', '```', *told, '```', ''])
+    (HERE / 'results' / 'first_day.md').write_text(text)
+    print('\n'.join([*lines, '', *rows]))
+
+
+if __name__ == '__main__':
+    main()
