@@ -72,16 +72,19 @@ def test_manifest_and_setup_give_the_same_version():
     assert manifest().findtext('version') == setup_value('version')
 
 
-@pytest.mark.parametrize('name', third_party_imports())
-def test_what_is_imported_is_declared(name):
+def test_what_is_imported_is_declared():
     keys = {element.text for element in manifest().iterfind('exec_depend')}
-    if name in keys:
-        return  # a ROS package, which has the name of its module and is not for setup.py
-    if name not in OPTIONAL:
-        assert ROSDEP_KEYS.get(name, f'python3-{name}') in keys, 'add it to package.xml'
     requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
-    distributions = packages_distributions().get(name, [name])
-    assert any(f"'{one}>=" in requirements for one in distributions), 'add it to setup.py'
+    distributions = packages_distributions()
+    # A ROS package has the name of its module, and is not for setup.py.
+    names = set(third_party_imports()) - keys
+    not_in_manifest = {name for name in names - OPTIONAL
+                       if ROSDEP_KEYS.get(name, f'python3-{name}') not in keys}
+    not_in_setup = {name for name in names if not any(f"'{one}>=" in requirements
+                                                      for one in distributions.get(name, [name]))}
+    assert names
+    assert not_in_manifest == set(), 'add them to package.xml'
+    assert not_in_setup == set(), 'add them to setup.py'
 
 
 def test_colcon_puts_executables_where_ros2_run_looks(prefix):
