@@ -87,15 +87,22 @@ def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
     assert simulated + engines.count <= whole.count + kills * (len(trials) - 1)
 
 
+@pytest.fixture(scope='module')
+def unkilled(tmp_path_factory):
+    """Return what a calibration tells that nobody kills, and how many rollouts it needs."""
+    options, whole = options_of('least squares'), Engines()
+    with EvaluationLog(tmp_path_factory.mktemp('whole') / 'log') as log:
+        return told(calibrate(toy_trials(2), options, make_simulator=whole, log=log)), whole.count
+
+
 @pytest.mark.parametrize('left', range(1, 60, 7))
-def test_what_comes_after_the_search_is_not_simulated_twice_either(left, tmp_path):
+def test_what_comes_after_the_search_is_not_simulated_twice_either(left, unkilled, tmp_path):
     """Advice, missing parameters and confirmation are rollouts: each counts."""
-    options, trials, whole = options_of('least squares'), toy_trials(2), Engines()
-    with EvaluationLog(tmp_path / 'whole') as log:
-        expected = told(calibrate(trials, options, make_simulator=whole, log=log))
+    options, trials = options_of('least squares'), toy_trials(2)
+    expected, count = unkilled
     with EvaluationLog(tmp_path / 'log') as log:
         with pytest.raises(Killed):
-            calibrate(trials, options, make_simulator=Engines(last=whole.count - left + 1), log=log)
+            calibrate(trials, options, make_simulator=Engines(last=count - left + 1), log=log)
         engines = Engines()
         assert told(calibrate(trials, options, make_simulator=engines, log=log)) == expected
     assert left <= engines.count <= left + (len(trials) - 1)  # one evaluation in the examination

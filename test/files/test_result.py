@@ -139,7 +139,7 @@ def test_document_is_for_people_too(file):
     assert any(re.fullmatch(r' +<found name="flexibility" value="[0-9.]+".*/>', line) for line in lines)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(text=st.text(max_size=30), value=st.floats(0, 100), length=st.floats(1e-6, 1e6))
 def test_any_text_and_number_survives(tmp_path_factory, result, text, value, length):
     path = tmp_path_factory.mktemp('any') / 'result.xml'
@@ -257,7 +257,7 @@ def test_place_that_cannot_be_written_is_refused(tmp_path, result):
         write_result(tmp_path / 'missing' / 'result.xml', result)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(place=st.floats(0, 1), octets=st.binary(max_size=6))
 def test_damaged_anywhere_is_read_or_refused(tmp_path_factory, result, place, octets):
     document = bytearray(description_document(result, OPTIONS.flat()))

@@ -94,7 +94,7 @@ def layouts(draw):
 
 
 @pytest.mark.parametrize('source', SOURCES)
-@settings(max_examples=150)
+@settings(max_examples=50)
 @given(layout=layouts(), seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9))
 def test_any_layout_is_read(source, layout, seed, count):
     types = SOURCES[source]()

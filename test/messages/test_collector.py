@@ -522,7 +522,7 @@ def feed(messages, options):
     return collector
 
 
-@settings(max_examples=250)
+@settings(max_examples=80)
 @given(session=sessions())
 def test_any_order_of_arrival_gives_the_same_trials(session):
     ordered, arrived, options = session
@@ -533,7 +533,7 @@ def test_any_order_of_arrival_gives_the_same_trials(session):
     assert list(map(str, one.problems)) == list(map(str, other.problems))
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(session=sessions(), again=st.data())
 def test_messages_sent_twice_change_nothing(session, again):
     ordered, arrived, options = session

@@ -4,6 +4,7 @@
 """The report is a page that shows the result in any browser, and needs no other file."""
 
 import base64
+from collections.abc import Mapping
 from dataclasses import replace
 import functools
 import hashlib
@@ -233,30 +234,47 @@ def browse(tmp_path_factory):
     return browse
 
 
-def framed(page: str, width: int, height: int) -> str:
-    """Return a page that shows another one in a frame, as no window is narrower than 500, and measures it."""
-    measure = ("let seen = this.contentDocument.documentElement; "
-               "document.body.append('measured ' + seen.scrollWidth + ' ' + seen.scrollHeight)")
-    return (f'<!DOCTYPE html><body style="margin:0"><iframe style="border:0" width="{width}" '
-            f'height="{height}" onload="{measure}" srcdoc="{escape(page)}"></iframe></body>')
+def framed(page: str, sizes: Mapping[int, int]) -> str:
+    """
+    Return a page that shows another one in frames side by side, and measures it in each.
+
+    A frame, because no window is narrower than 500.
+
+    :param sizes: height of the frame of each width.
+    """
+    measure = ("let seen = this.contentDocument.documentElement; document.body.append("
+               "'measured in ' + this.width + ': ' + seen.scrollWidth + ' ' + seen.scrollHeight + '; ')")
+    frames = (f'<iframe style="border:0; vertical-align:top" width="{width}" height="{height}" '
+              f'onload="{measure}" srcdoc="{escape(page)}"></iframe>' for width, height in sizes.items())
+    return f'<!DOCTYPE html><body style="margin:0; white-space:nowrap">{"".join(frames)}</body>'
 
 
-@pytest.mark.parametrize('width', WIDTHS)
-def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path, width):
+def needed(document: str, width: int) -> tuple[int, int]:
+    """Return the width and the height that a page needs in a frame, from the document with that frame."""
+    across, down = re.search(rf'measured in {width}: (\d+) (\d+);', document).groups()
+    return int(across), int(down)
+
+
+def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path):
     frame, shot = tmp_path / 'frame.html', tmp_path / 'shot.png'
-    frame.write_text(framed(drawn, width, 1000), encoding='utf-8')
-    across, down = map(int, re.search(r'measured (\d+) (\d+)', browse('--dump-dom', frame.as_uri())).groups())
-    assert across <= width
-    assert down > 3000
-    frame.write_text(framed(drawn, width, down), encoding='utf-8')
-    browse(f'--screenshot={shot}', f'--window-size={max(width, 600)},{down}', frame.as_uri())
-    seen = np.asarray(Image.open(shot).convert('L'))[:, :width]
-    assert (seen[:, :4] > 250).all() and (seen[:, -2:] > 250).all()  # nothing is cut off at the sides
-    for part in np.array_split(seen, down // 1000):
-        assert (part < 128).mean() > 0.002  # there is something to read everywhere
+    frame.write_text(framed(drawn, dict.fromkeys(WIDTHS, 1000)), encoding='utf-8')
+    document = browse('--dump-dom', frame.as_uri())
+    heights = {}
+    for width in WIDTHS:
+        across, heights[width] = needed(document, width)
+        assert across <= width
+        assert heights[width] > 3000
+    frame.write_text(framed(drawn, heights), encoding='utf-8')
+    browse(f'--screenshot={shot}', f'--window-size={sum(WIDTHS)},{max(heights.values())}', frame.as_uri())
+    whole, left = np.asarray(Image.open(shot).convert('L')), 0
+    for width, down in heights.items():
+        seen, left = whole[:down, left:left + width], left + width
+        assert (seen[:, :4] > 250).all() and (seen[:, -2:] > 250).all()  # nothing is cut off at the sides
+        for part in np.array_split(seen, down // 1000):
+            assert (part < 128).mean() > 0.002  # there is something to read everywhere
 
 
 def test_measure_sees_what_is_too_wide(browse, tmp_path):
     frame = tmp_path / 'frame.html'
-    frame.write_text(framed('<div style="width:700px">wide</div>', 390, 500), encoding='utf-8')
-    assert int(re.search(r'measured (\d+)', browse('--dump-dom', Path(frame).as_uri()))[1]) >= 700
+    frame.write_text(framed('<div style="width:700px">wide</div>', {390: 500}), encoding='utf-8')
+    assert needed(browse('--dump-dom', Path(frame).as_uri()), 390)[0] >= 700
