@@ -17,7 +17,6 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
-from dlo_calibration.search.sobol import Sobol
 
 # Steps and distances are in the unit cube.
 FIRST_STEP = 0.015  # of a finite difference; larger steps mislead beside a narrow valley
@@ -192,16 +191,18 @@ class LeastSquares(PlannedSearch):
 
     def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
         """Ask for start points until at least one can be simulated."""
+        from scipy.stats import qmc
+
         # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
-        sobol = Sobol(self._dimension, self._seed)
+        sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
         hint = np.clip(self._hints.start, 0, 1)
         if self._hints.refines:
             observations = yield hint[None, :]
             if observations[0].residuals is not None:
                 return list(observations)
         while True:
-            points = sobol.points(count)
+            points = sobol.random(count)
             # Half of them have the prior estimate: a good one saves a lot, a wrong one spoils only half.
             points[::2] = np.where(np.isnan(hint), points[::2], hint)
             points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
