@@ -30,6 +30,7 @@ from dlo_calibration.model.parameters import (
     PAPER_PARAMETERS,
     PARAMETERS,
     ParameterSpace,
+    REST_SHAPE,
     SCALE,
 )
 from dlo_calibration.model.quantity import measured
@@ -159,8 +160,10 @@ class Options(DeclaredOptions):
         adds those that the trials show.
         """
         named = ParameterSpace(self._names)
+        bent = {name: value for name, value in self.values.items()
+                if name in REST_SHAPE and value != BY_NAME[name].default}
         return ParameterSpace(self._names, self.values, self.mass).divided(
-            max(self.parts, named.parts)).shaped(named.knots)
+            max(self.parts, named.parts)).shaped(named.knots or ParameterSpace(self._names, bent).knots)
 
     @property
     def _names(self) -> tuple[str, ...]:

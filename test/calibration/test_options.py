@@ -11,7 +11,7 @@ import pytest
 
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import declarations, FIXED_VALUES, Options
-from dlo_calibration.model.parameters import PARAMETERS
+from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, REST_SHAPE
 from dlo_calibration.search import SEARCHES
 
 DECLARED = {declaration.name: declaration for declaration in declarations()}
@@ -176,3 +176,11 @@ def test_there_are_as_many_parts_as_calibrate_names():
     space = Options.of({'calibrate': ['flexibility', 'stiffness_3'], 'parts': 2}).space
     assert space.free == ('flexibility', 'stiffness_3', 'stiffness_2')
     assert Options.of({'calibrate': ['stiffness_3']}).space.parts == 3
+
+
+def test_a_rest_shape_that_is_given_is_simulated_though_it_is_not_calibrated():
+    space = Options(values={'rest_curvature_y4': 70.0}).space
+    assert space.knots == 5
+    assert not set(space.free) & set(REST_SHAPE)
+    assert space.physical({}, 1.0)['rest_curvature_y4'] == BY_NAME['rest_curvature_y4'].physical(70.0)
+    assert 'rest_curvature_y4' not in Options().space.physical({}, 1.0)
