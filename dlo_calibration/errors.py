@@ -9,8 +9,9 @@ What came from outside can be in their texts: they are one line, short, and safe
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 import re
-from typing import Sequence
+from typing import Iterable, Sequence
 
 DEFECT = 'this is a defect of dlo_calibration, please report it'  # ends the report of an unexpected error
 LONGEST = 300  # characters of an error's text: a few lines of a terminal, whatever came
@@ -94,6 +95,26 @@ def _fitting(parts: Sequence[str], most: int) -> list[str]:
     while sum(min(len(part), limit) for part in parts) > most:
         limit -= 1
     return [shortened(part, limit) for part in parts]
+
+
+def one_of(known: Iterable[str], name: str) -> str:
+    """Say that one of the known names was expected: all of them, or the nearest ones if there are many."""
+    known = list(known)
+    if len(known) <= 8:  # they fit into an error
+        return f'one of {", ".join(known)}'
+    near = get_close_matches(shortened(name), known, n=3, cutoff=0)
+    return f'one of {", ".join(near)} or {len(known) - len(near)} others'
+
+
+def meant(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return the remedy for an unknown name: the known one that was probably meant; else `otherwise`."""
+    plain = {_plain(one): one for one in known}
+    near = get_close_matches(_plain(shortened(name, 100)), plain, n=1)
+    return f'did you mean {plain[near[0]]}?' if near else otherwise
+
+
+def _plain(name: str) -> str:
+    return name.lower().strip('-').replace('-', '_')
 
 
 def unwritable(path: object, error: OSError, kind: str = 'file') -> InputError:

@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from difflib import get_close_matches
 from typing import Any, Mapping, NoReturn, Self, Sequence
 
-from dlo_calibration.errors import InputError, shortened
+from dlo_calibration.errors import InputError, meant, one_of
 
 #: What an option describes: how trials were observed; what is searched and simulated; the user's machines:
 #: computer and robot. Files never set those of the machines (`file_options`). The mass belongs to the
@@ -58,7 +57,8 @@ class Declaration:
         if self.choices:
             for one in value if kind is tuple else (value,):
                 if one not in self.choices:
-                    raise InputError(what, f'{one!r}', _one_of(self.choices, one), 'choose one of them')
+                    raise InputError(what, f'{one!r}', one_of(self.choices, one),
+                                     meant(one, self.choices, 'choose one of them'))
         low, high = self.minimum, self.maximum
         if kind in (int, float) and not (
                 (low is None or value >= low) and (high is None or value <= high)):
@@ -130,12 +130,5 @@ class DeclaredOptions:
 
 def refuse_name(name: str, known: Sequence[str]) -> NoReturn:
     """Raise the InputError for an option with an unknown name."""
-    raise InputError('parameter', repr(name), _one_of(known, name), 'correct the name')
-
-
-def _one_of(known: Sequence[str], name: str) -> str:
-    """Say that one of the known names was expected: all of them, or the nearest ones if there are many."""
-    if len(known) <= 8:  # they fit into an error
-        return f'one of {", ".join(known)}'
-    near = get_close_matches(shortened(name), known, n=3, cutoff=0)
-    return f'one of {", ".join(near)} or {len(known) - len(near)} others in doc/messages.md'
+    raise InputError('parameter', repr(name), f'{one_of(known, name)} in doc/messages.md',
+                     meant(name, known, 'correct the name'))

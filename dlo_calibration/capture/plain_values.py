@@ -10,7 +10,7 @@ import math
 import re
 from typing import Any, Iterator, Sequence
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant
 
 REMEDY = 'correct the document, or take the action back'
 
@@ -71,7 +71,8 @@ class Entry:
     def choice(self, choices: Sequence[str]) -> str:
         """Return one of some texts."""
         if not isinstance(self.value, str) or self.value not in choices:
-            raise self.refused(_shown(self.value), f'one of {", ".join(choices)}')
+            raise InputError(self.where, _shown(self.value), f'one of {", ".join(choices)}',
+                             meant(str(self.value)[:200], choices, REMEDY))
         return self.value
 
     def entries(self, least: int, most: int) -> Iterator[Entry]:
@@ -107,7 +108,7 @@ class Values:
         unknown = next((name for name in self.content if name not in known), None)
         if unknown is not None:
             raise InputError(self.where or 'document', f'an unknown field {_shown(unknown)}',
-                             f'fields of {", ".join(known)}', REMEDY)
+                             f'fields of {", ".join(known)}', meant(unknown, known, REMEDY))
 
     def entry(self, name: str, default: Any = None) -> Entry:
         """Return a value by its name; the default where there is none."""

@@ -25,7 +25,7 @@ from dlo_calibration.capture.interpretation import Interpretation, Interpreter
 from dlo_calibration.capture.pictures import Pictures
 from dlo_calibration.capture.project import Project
 from dlo_calibration.capture.steps import KINDS
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant
 from dlo_calibration.evaluation.log import digest
 from dlo_calibration.files.chain_file import chain_csv, chain_xml
 from dlo_calibration.model.trial import Trial
@@ -142,7 +142,7 @@ class CaptureSession:
             unknown = [name for name in given if name not in ('evaluations', 'seed')]
             if unknown:
                 raise InputError('calibration', f'an option {unknown[0]!r}', 'evaluations or seed',
-                                 'leave it out')
+                                 meant(unknown[0], ('evaluations', 'seed'), 'leave it out'))
             self._calibrating.take()
             path = self._write_session(given)
             self._information.pause()

@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 from signal import SIGINT
 import sys
-from typing import NoReturn, Sequence
+from typing import Any, NoReturn, Sequence
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli import capture, experiment, fit, info, plan, plot, simulate, trace, validate
 from dlo_calibration.cli.output import tell
-from dlo_calibration.errors import DloCalibrationError, printable
+from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
@@ -33,7 +33,11 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
         report, or before an experiment was complete.
     """
     try:
-        chosen = _parser().parse_args(args)
+        words = sys.argv[1:] if args is None else args
+        if words and words[0] not in VERBS and not words[0].startswith('-'):
+            raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
+                             meant(words[0], VERBS, f'see {PROGRAM} --help'))
+        chosen = _parser().parse_args(words)
         code: int = chosen.act(chosen, make_simulator)
         return code
     except DloCalibrationError as error:
@@ -48,7 +52,16 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that reports an error in one line."""
+    """A parser that reports an error in one line, and names the flag that was probably meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse a flag that this verb does not have."""
+        chosen, rest = super().parse_known_args(args, namespace)
+        strange = [word.partition('=')[0] for word in rest if word.startswith('--')]
+        if strange and self.prog != PROGRAM:
+            hint = meant(strange[0], self._option_string_actions, '')
+            self.error(f'unrecognized arguments: {" ".join(rest)}{"; " if hint else ""}{hint}')
+        return chosen, rest
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'{self.prog}: {printable(" ".join(message.split()))}; see {self.prog} --help\n')

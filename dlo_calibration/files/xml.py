@@ -27,7 +27,7 @@ import numpy as np
 from dlo_calibration.calibration.declaration import Declaration
 from dlo_calibration.calibration.file_options import file_options, FileOptions, recordable
 from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant
 from dlo_calibration.files.intake import require_file
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import exact
@@ -303,4 +303,25 @@ def _schema_error(where: str, entry: Any, schema: str) -> InputError:
             break
     came = f'attribute {attribute!r}: {text}' if attribute else text
     return InputError(f'{where}, line {entry.line}, element <{tag}>', _short(came.rstrip('.')),
-                      _short(expected), 'correct the file')
+                      _short(expected), _remedy(tag, attribute, text, expected))
+
+
+def _remedy(tag: str, attribute: str | None, text: str, expected: str) -> str:
+    """Return what to do about the first error of the schema: use the name that was probably meant."""
+    value = re.match(r"The value '(.*)' is not$", text)
+    permitted = re.findall(r'[\w-]+', expected.removeprefix('one of '))
+    if value:
+        return meant(value[1], permitted, 'correct the file')
+    kind, name = ('attribute', attribute) if attribute else ('element', tag)
+    known = _names(kind)
+    if name in known or attribute and 'not allowed' not in text:  # it is not misspelt, but in a wrong place
+        return 'correct the file'
+    return meant(name, known if attribute else permitted, 'correct the file')
+
+
+def _names(kind: str) -> set[str]:
+    """Return the names of all elements, or attributes, in the schemas."""
+    with as_file(files('dlo_calibration') / 'files/schema') as folder:
+        return {one.get('name') for path in folder.glob('*.xsd')
+                for one in etree.parse(str(path)).iter(f'{{http://www.w3.org/2001/XMLSchema}}{kind}')
+                if one.get('name')}

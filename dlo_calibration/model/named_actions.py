@@ -23,7 +23,7 @@ from typing import ClassVar, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant, one_of
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats
 
@@ -314,9 +314,11 @@ class TwoHands(NamedAction):
         if self.fractions is not None:
             object.__setattr__(self, 'fractions', tuple(float(one) for one in self.fractions))
         if self.motion not in ('apart', 'together'):
-            raise self._refused(f'motion {self.motion!r}', 'apart or together')
+            raise self._refused(f'motion {self.motion!r}', 'apart or together',
+                                meant(self.motion, ('apart', 'together'), 'correct the action'))
         if self.moving not in MOVING:
-            raise self._refused(f'moving {self.moving!r}', f'one of {", ".join(MOVING)}')
+            raise self._refused(f'moving {self.moving!r}', one_of(MOVING, self.moving),
+                                meant(self.moving, MOVING, 'correct the action'))
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the paths of both hands, whose waypoints have the same times."""

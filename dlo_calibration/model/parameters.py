@@ -18,7 +18,7 @@ from typing import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant
 from dlo_calibration.model.chain import Floats
 
 SCALE = 100.0  # the upper end of the paper's scale
@@ -156,7 +156,7 @@ class ParameterSpace:
         for name in (*free, *self.fixed):
             if name not in BY_NAME:
                 raise InputError('parameter', repr(name), f'one of {", ".join(BY_NAME)}',
-                                 'correct the name')
+                                 meant(name, BY_NAME, 'correct the name'))
         if not free or len(set(free)) < len(free):
             raise InputError('calibrate', str(list(free)), 'one or more different names',
                              'name each parameter to find once')

@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A misspelt name is answered with the one that was probably meant, wherever names are read."""
+
+from pathlib import Path
+
+import pytest
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.capture.plain_values import Entry
+from dlo_calibration.cli import main as cli
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.request import request_of
+from dlo_calibration.model.named_actions import TwoHands
+from dlo_calibration.model.parameters import ParameterSpace
+
+SAMPLES = Path(__file__).resolve().parents[2] / 'msg_samples'
+OBJECT = str(SAMPLES / 'object1')
+
+
+@pytest.mark.parametrize('words, meant', [
+    ('ft', 'fit'), ('valdate', 'validate'), ('fit x --evalations 5', '--evaluations'),
+    ('fit x --bending_frction 5', '--bending_friction'),
+    (f'fit {OBJECT} --search least-square', 'least_squares'), (f'fit {OBJECT} --engine Bulet', 'bullet'),
+    (f'fit {OBJECT} --calibrate flexibilty friction', 'flexibility'),
+    ('experiment --search lest_squares', 'least_squares')])
+def test_the_command_line_names_what_was_meant(words, meant, capsys):
+    try:
+        code = cli.main(words.split())
+    except SystemExit as end:
+        code = end.code
+    output, errors = capsys.readouterr()
+    assert (code, output, errors.count('\n')) == (2, '', 1)
+    assert f'did you mean {meant}?' in errors
+
+
+def test_a_name_that_resembles_none_is_only_refused(capsys):
+    assert cli.main(['zzz']) == 2
+    assert 'did you mean' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('wrong, right, meant', [
+    ('<grasp_and_plase', '<grasp_and_place', 'grasp_and_place'), (' sped=', ' speed=', 'speed'),
+    ('"togeter"', '"together"', 'together'), ('"evalutions"', '"evaluations"', 'evaluations'),
+    ('name="search" value="randon"', 'name="seed" value="1"', 'random')])
+def test_a_document_names_what_was_meant(wrong, right, meant):
+    text = (SAMPLES / 'xml' / 'named_actions.xml').read_text(encoding='utf-8')
+    assert right in text
+    with pytest.raises(InputError, match=rf'did you mean {meant}\?'):
+        request_of(text.replace(right, wrong).encode())
+
+
+def test_a_place_that_is_wrong_is_no_misspelling():
+    text = (SAMPLES / 'xml' / 'named_actions.xml').read_text(encoding='utf-8')
+    with pytest.raises(InputError) as refused:
+        request_of(text.replace('<initial_chain', '<goal_chain', 1).replace(
+            '</initial_chain', '</goal_chain', 1).encode())
+    assert 'did you mean' not in str(refused.value)
+
+
+@pytest.mark.parametrize('make, meant', [
+    (lambda: Options.of({'sead': 2}), 'seed'), (lambda: Options(search='cmaes'), 'cma_es'),
+    (lambda: ParameterSpace(('frction',)), 'friction'),
+    (lambda: TwoHands(fractions=(0.1, 0.9), motion='togther'), 'together'),
+    (lambda: Entry('', {'photografs': []}).values('photographs', 'trials'), 'photographs')],
+    ids=['option', 'search', 'parameter', 'named action', 'JSON'])
+def test_the_library_names_what_was_meant(make, meant):
+    with pytest.raises(InputError, match=rf'did you mean {meant}\?'):
+        make()
