@@ -115,6 +115,7 @@ def _command(chosen: argparse.Namespace, searches: Sequence[str]) -> str:
 
     words = ['dlo-calibration', 'experiment', *map(str, chosen.sessions), '--runs', str(chosen.runs),
              '--search', ','.join(searches)]
+    words += [word for text in chosen.remap for word in ('--remap', text)]
     words += ['--held-back', *map(str, chosen.held_back)] if chosen.held_back else []
     words += ['--validate-on', *map(str, chosen.validate_on)] if chosen.validate_on else []
     words += [flag for name, value in given_options(chosen).items() for flag in as_flags(name, value)]

@@ -28,7 +28,7 @@ from dlo_calibration.cli.result_files import (
     SESSION,
     write_files,
 )
-from dlo_calibration.cli.source import add_source, read_source, Source
+from dlo_calibration.cli.source import add_source, left_out, read_source, Source
 from dlo_calibration.cli.unfinished import Unfinished
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
@@ -70,7 +70,9 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if folder is not None:
             make_folder(folder)  # before hours are spent on a search
             unfinished = unfinished or stack.enter_context(Unfinished(folder, INPUTS))
-            log = unfinished.begin(source, chosen.namespace, lambda path: keep_input(path, source), tell)
+            namespace = None if source.session.messages.remapped else chosen.namespace
+            log = unfinished.begin(source, namespace, lambda path: keep_input(path, source), tell,
+                                   left_out(chosen))
         stopped = _fit(chosen, source, folder, make_simulator, log)
         if unfinished is not None and not stopped:
             unfinished.remove()
@@ -132,7 +134,8 @@ def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> i
         if chosen.session is None:
             chosen.session = folder / (REQUEST if (folder / REQUEST).is_file() else SESSION)
         source = read_source(chosen, tell, file.file_options).require_trials()
-        result = replace(validated(file, source.trials, source.options, make_simulator),
+        trials = [trial for trial in source.trials if trial.name in file.trials]
+        result = replace(validated(file, trials, source.options, make_simulator),
                          warnings=file.warnings, confirmation=file.confirmation)
         print_json({**plain(result), **{name: getattr(file, name) for name in HOW}})
     return 0

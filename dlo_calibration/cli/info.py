@@ -12,6 +12,7 @@ from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.cli.source import add_source, read_source, Source
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.trial import Trial
 
 TEXT = 'show what a session contains'
@@ -22,7 +23,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     from dlo_calibration.report import terminal
 
-    about = _about(read_source(chosen, lambda text: None))
+    about = _about(read_source(chosen, lambda text: None, any_topics=True))
     if chosen.json:
         print_json(about)
     else:
@@ -38,16 +39,29 @@ def _about(source: Source) -> dict[str, Any]:
         'session': str(source.path), 'duration_s': source.session.duration,
         'frames': list(source.session.frames),
         'messages': dict(sorted(source.session.counts.items())),
+        'unknown_topics': [_about_topic(topic, kind, source.session.counts[topic])
+                           for topic, kind in source.session.others.items()],
         'options': source.session.recorded, 'calibrate': list(choice.options.calibrate),
         'choice': choice.words,
-        'trials': [_about_trial(trial) for trial in source.trials],
+        'trials': [_about_trial(number, trial)
+                   for number, trial in zip(source.numbers, source.trials, strict=True)],
         'refusals': list(source.refusals), 'problems': list(source.session.problems)}
 
 
-def _about_trial(trial: Trial) -> dict[str, Any]:
+def _about_topic(topic: str, kind: str, count: int) -> dict[str, Any]:
+    """Describe a topic that the calibrator does not know, and say what it could be."""
+    fits = [name for name, needed in INPUT_TYPES.items() if needed == kind]
+    hint = f'if {topic} has the actions, add --remap {topic}:={ACTION}'
+    if GOAL in fits:
+        hint = f'if {topic} has the chains after the actions, add --remap {topic}:={GOAL}; if it has those ' \
+               f'before them, {topic}:={INITIAL}'
+    return {'topic': topic, 'type': kind, 'messages': count, 'hint': hint if fits else ''}
+
+
+def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
     chains = [trial.initial, *(goal.chain for goal in trial.goals)]
     return {
-        'name': trial.name, 'points': len(trial.initial), 'length_m': trial.initial.length,
+        'number': number, 'name': trial.name, 'points': len(trial.initial), 'length_m': trial.initial.length,
         'hands': [{'name': hand.name, 'grips': list(hand.grips), 'waypoints': len(hand.times),
                    'start_s': hand.start, 'end_s': hand.end} for hand in trial.hands],
         'actions': len(trial.actions), 'goals': len(trial.goals),

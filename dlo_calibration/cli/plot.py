@@ -41,12 +41,14 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     file = None if chosen.result is None else read_result(chosen.result)
     source = read_source(chosen, tell, None if file is None else file.file_options).require_trials()
     result = None if file is None else validated(file, source.trials, source.options, make_simulator)
-    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell)
+    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell,
+                              source.numbers)
     animations: list[Path] = []
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)
         with closing(make_simulator(source.options)) as simulator:
-            animations = write_animations(result.trials, simulator, physical, chosen.output, tell)
+            animations = write_animations(result.trials, simulator, physical, chosen.output, tell,
+                                          source.numbers)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
                     'animations': [str(path) for path in animations]})

@@ -55,7 +55,8 @@ def write_files(folder: Path, source: Source, result: CalibrationResult, make_si
     with attempts.attempt(REPORT):
         repeated = REQUEST if source.is_request else SESSION
         repeatable = [folder / repeated] if repeated in attempts.written else []
-        origin = Origin(source.path.name, repeating_command(repeated, source.options), source.options,
+        origin = Origin(source.path.name, repeating_command(repeated, source.options, source.selection),
+                        source.options,
                         digests([*_recorded(source.path), *repeatable]),
                         [*source.session.problems, *source.refusals])
         write_report(folder / REPORT, result, origin,
@@ -73,13 +74,17 @@ def _write_session(path: Path, source: Source) -> None:
     """
     Write a session as one MCAP file; if it is one already, copy the file.
 
+    Of a session with remapped topics, only the inputs are written, under the names of the calibrator.
     For a request, write the messages that a robot would have sent.
     """
     files = [source.path] if source.path.is_file() else sorted(source.path.glob('*.mcap'))
-    if len(files) == 1 and files[0].suffix == '.mcap':
+    remapped = source.session.messages.remapped
+    if len(files) == 1 and files[0].suffix == '.mcap' and not remapped:
         _copy(files[0], path)
         return
     records, options = source.session.records, source.session.recorded
+    if remapped:
+        records = source.session.messages.renamed
     if source.is_request:
         records, options = trial_records(source.trials), source.options.flat()
     with whole(path) as new, SessionWriter(new, options) as writer:

@@ -17,7 +17,7 @@ from dlo_calibration.cli.options import add_options
 from dlo_calibration.cli.output import print_json, standard_output, tell
 from dlo_calibration.cli.plan import SIMULATION
 from dlo_calibration.cli.prediction_files import write_prediction_files
-from dlo_calibration.cli.source import add_common_arguments, read_manipulations
+from dlo_calibration.cli.source import add_common_arguments, add_without, read_manipulations
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.manipulation import Manipulation
@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('session', metavar='SESSION', type=Path, help=(
         'an MCAP file, the folder of a rosbag2 recording, or an XML request: initial chains and actions; '
         'goal chains are not needed'))
+    add_without(parser)
     add_common_arguments(parser)
     parser.add_argument('--output', metavar='DIR', type=Path, help=(
         'write to this folder, for each trial: a picture, an animation, and the chain after each action as '

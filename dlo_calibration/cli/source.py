@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any, Callable, Sequence
 
 from dlo_calibration.calibration.declaration import OBSERVATION
 from dlo_calibration.calibration.file_options import FileOptions
 from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of
 from dlo_calibration.files.request import (
     read_request,
     Request,
@@ -28,6 +28,7 @@ from dlo_calibration.files.session import (
     session_manipulations,
     session_trials,
 )
+from dlo_calibration.messages.codec import INPUT_TYPES
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
@@ -40,6 +41,8 @@ class Source:
     :param session: as recorded; for a request, a session without messages.
     :param refusals: one text for each message that is not used, with the reason.
     :param refusal: why the scene in a file is not among the options; without it, nothing is simulated.
+    :param numbers: of the trials, from 1; those that the user leaves out have numbers, too.
+    :param selection: the flags that select the same trials in the files of a result.
     """
 
     session: Session
@@ -47,6 +50,8 @@ class Source:
     trials: tuple[Trial, ...]
     refusals: tuple[str, ...]
     refusal: InputError | None = None
+    numbers: tuple[int, ...] = ()
+    selection: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -79,13 +84,23 @@ def add_source(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     """Add the arguments that name a source, and the options to use on it."""
     parser.add_argument('session', metavar='SESSION', type=Path, nargs='?' if optional else None,
                         help='an MCAP file, the folder of a rosbag2 recording, or an XML request')
+    add_without(parser)
     add_common_arguments(parser)
     add_options(parser)
+
+
+def add_without(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that leaves trials out."""
+    parser.add_argument('--without', metavar='K', action='append', default=[],
+                        help='leave out the trial with this number, or several: 2,5')
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that every verb has."""
     parser.add_argument('--namespace', help='namespace of the topics, if a session has several')
+    parser.add_argument('--remap', metavar='TOPIC:=NAME', action='append', default=[],
+                        help=f'read a topic with another name as {one_of(INPUT_TYPES, "")}, '
+                        'e.g. /trackdlo/results_pc:=goal_chain; may be repeated')
     parser.add_argument('--json', action='store_true', help='print one JSON document')
 
 
@@ -95,7 +110,8 @@ def is_request(path: Path) -> bool:
 
 
 def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
-                of_result: FileOptions | None = None, path: Path | None = None) -> Source:
+                of_result: FileOptions | None = None, path: Path | None = None, *,
+                any_topics: bool = False) -> Source:
     """
     Read a session or a request, with the options recorded in it; options given as flags override them.
 
@@ -103,15 +119,67 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
     :param note: called with each sentence that the user should read.
     :param of_result: options of a result; they override the recorded ones, except those of the observation.
     :param path: of the source; None: the one on the command line.
-    :raises InputError: if it cannot be read, or an option has a bad value.
+    :param any_topics: a session without any topic of the calibrator is read, too.
+    :raises InputError: if it cannot be read, an option has a bad value, or a trial to leave out is not there.
     """
-    opened = _open(chosen, note, of_result, chosen.session if path is None else path)
+    opened = _open(chosen, note, of_result, chosen.session if path is None else path, any_topics)
     session, request, options = opened.session, opened.request, opened.options
     trials, refusals = session_trials(session, options) if request is None else \
         request_trials(request, options)
     for text in (*opened.problems, *(refusals if trials or request is None else ())):
         note(text)  # where no trial of a request can be used, `require_trials` says why
-    return Source(session, options, trials, refusals, opened.refusal)
+    out = left_out(chosen)
+    kept = _kept(out, [trial.name for trial in trials], note)
+    selection = ['--without', ','.join(map(str, out))] if out else []
+    if chosen.namespace and not session.messages.remapped:
+        selection += ['--namespace', chosen.namespace]
+    return Source(session, options, tuple(trials[number - 1] for number in kept), refusals, opened.refusal,
+                  kept, tuple(selection))
+
+
+def left_out(chosen: argparse.Namespace) -> tuple[int, ...]:
+    """
+    Return the numbers of the trials that a command line leaves out.
+
+    :raises InputError: if they are no numbers.
+    """
+    words = [word for text in getattr(chosen, 'without', ()) for word in text.split(',')]
+    for word in words:
+        if not word.isdecimal() or len(word) > 9:
+            raise InputError('--without', repr(word), 'numbers of trials, e.g. 2,5',
+                             'see them with dlo-calibration info')
+    return tuple(sorted(set(map(int, words))))
+
+
+def _kept(out: Sequence[int], names: Sequence[str], note: Callable[[str], None]) -> tuple[int, ...]:
+    """Return the numbers of the trials that are not left out; tell the names of the others."""
+    wrong = [number for number in out if not 1 <= number <= len(names)]
+    if wrong:
+        raise InputError('--without', f'trial {wrong[0]}', f'1 to {len(names)}' if names else
+                         'nothing, as no trial is complete', 'see the numbers with dlo-calibration info')
+    kept = tuple(number for number in range(1, len(names) + 1) if number not in out)
+    if out and not kept:
+        raise InputError('--without', 'all trials', f'at least one of the {len(names)} that stays',
+                         'leave out fewer')
+    for number in out:
+        note(f'{names[number - 1]} is left out')
+    return kept
+
+
+def _remap(chosen: argparse.Namespace) -> dict[str, str]:
+    """Return the input topic as which each topic of a command line is read."""
+    found: dict[str, str] = {}
+    for text in getattr(chosen, 'remap', ()):
+        topic, sign, kind = text.partition(':=')
+        kind, topic = kind.removeprefix('~/'), f'/{topic.lstrip("/")}'
+        if not sign or kind not in INPUT_TYPES:
+            raise InputError('--remap', repr(text), f'TOPIC:=NAME, where NAME is {one_of(INPUT_TYPES, kind)}',
+                             meant(kind, INPUT_TYPES, 'write it like /trackdlo/results_pc:=goal_chain'))
+        if topic in found or kind in found.values():
+            raise InputError('--remap', f'{topic if topic in found else kind} twice', 'each once',
+                             'leave one of them out')
+        found[topic] = kind
+    return found
 
 
 def read_manipulations(chosen: argparse.Namespace, note: Callable[[str], None],
@@ -124,6 +192,7 @@ def read_manipulations(chosen: argparse.Namespace, note: Callable[[str], None],
     :raises InputError: if it cannot be read, has no action, or an option has a bad value.
     """
     opened = _open(chosen, note, of_result, chosen.session)
+    out = left_out(chosen)
     if opened.refusal is not None:
         raise opened.refusal
     found, refusals = session_manipulations(opened.session, opened.options) if opened.request is None else \
@@ -134,7 +203,8 @@ def read_manipulations(chosen: argparse.Namespace, note: Callable[[str], None],
         raise InputError(f'session {chosen.session}', 'no action that can be simulated',
                          'an initial_chain, and an action after it',
                          'see what it contains with dlo-calibration info')
-    return found, opened.options
+    kept = _kept(out, [one.name for one in found], note)
+    return tuple(found[number - 1] for number in kept), opened.options
 
 
 @dataclass(frozen=True)
@@ -155,10 +225,12 @@ class _Opened:
 
 
 def _open(chosen: argparse.Namespace, note: Callable[[str], None], of_result: FileOptions | None,
-          path: Path) -> _Opened:
+          path: Path, any_topics: bool = False) -> _Opened:
     """Read a session or a request, without its trials; see `read_source`."""
-    request = read_request(path) if is_request(path) else None
-    session = read_session(path, chosen.namespace) if request is None else \
+    request, remap = read_request(path) if is_request(path) else None, _remap(chosen)
+    if request is not None and remap:
+        raise InputError('--remap', 'a request, which has no topics', 'a recorded session', 'leave it out')
+    session = read_session(path, chosen.namespace, remap, any_topics=any_topics) if request is None else \
         Session(path, Messages(), (), dict(request.options), request.problems, request.refusal)
     recorded, problems, refusal = session.recorded or {}, session.problems, session.refusal
     if of_result:

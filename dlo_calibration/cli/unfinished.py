@@ -18,7 +18,7 @@ from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.identity import calibration_digest
 from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.cli.options import given_options, PREFIX
-from dlo_calibration.cli.source import Source
+from dlo_calibration.cli.source import left_out, Source
 from dlo_calibration.errors import InputError, unwritable
 from dlo_calibration.evaluation.log import CALIBRATION, Entry, EvaluationLog
 from dlo_calibration.writing import reason
@@ -34,11 +34,13 @@ class Begun:
 
     :param digest: of its trials and options.
     :param options: without those of the machine.
+    :param without: numbers of the trials that are left out.
     """
 
     digest: str
     namespace: str | None
     options: Mapping[str, Any]
+    without: tuple[int, ...] = ()
 
 
 class Unfinished:
@@ -90,17 +92,25 @@ class Unfinished:
             # A stranger's log must not choose a file of this machine: its user names the scene again.
             if name not in given and name not in machine and name != 'scene':
                 setattr(chosen, f'{PREFIX}{name}', value)
+        if left_out(chosen) not in ((), begun.without):
+            raise InputError('--without beside --resume', ','.join(chosen.without),
+                             f'{",".join(map(str, begun.without)) or "none"}, as at the beginning',
+                             'leave it out, or begin anew with fit SESSION and another --output')
+        chosen.without = [str(number) for number in begun.without]
         chosen.namespace = chosen.namespace or begun.namespace
+        if chosen.session is None:
+            chosen.remap = []  # the copy of the input has the calibrator's names
         there = [self.path / name for name in self._inputs if (self.path / name).exists()]
         chosen.session = chosen.session or [*there, self.path / self._inputs[0]][0]
 
     def begin(self, source: Source, namespace: str | None, copy: Callable[[Path], None],
-              note: Callable[[str], None]) -> EvaluationLog | None:
+              note: Callable[[str], None], without: tuple[int, ...] = ()) -> EvaluationLog | None:
         """
         Keep the input of a calibration that begins or goes on; return its log.
 
         :param copy: writes the input into a folder.
         :param note: called with each sentence that the user should read.
+        :param without: numbers of the trials that are left out.
         :returns: None if the disk refuses: the calibration is possible, but not after an interruption.
         :raises InputError: if another calibration is kept here.
         """
@@ -117,7 +127,8 @@ class Unfinished:
         if begun is None:
             options = {name: value for name, value in source.options.flat().items()
                        if name not in names_of(MACHINE)}
-            text = json.dumps({'digest': digest, 'namespace': namespace, 'options': options})
+            text = json.dumps({'digest': digest, 'namespace': namespace, 'options': options,
+                               'without': without})
             try:
                 copy(self.path)
                 self.log.add(CALIBRATION, Entry(np.zeros(0), text))
@@ -162,6 +173,6 @@ def _begun(log: EvaluationLog) -> Begun | None:
     try:
         begun = Begun(**json.loads(entry.text))
         return Begun(str(begun.digest), begun.namespace and str(begun.namespace),
-                     Options.of(begun.options).flat())
+                     Options.of(begun.options).flat(), tuple(int(number) for number in begun.without))
     except (ValueError, TypeError, AttributeError, RecursionError, InputError):  # a stranger's
         return None

@@ -46,11 +46,15 @@ def encode(message: Any, message_type: str) -> bytes:
 
 
 class Bag:
-    """The parts of a recording that were read so far, from one or more files."""
+    """
+    The parts of a recording that were read so far, from one or more files.
 
-    def __init__(self, path: Path) -> None:
+    :param remap: topic -> name of the input topic as which it is read.
+    """
+
+    def __init__(self, path: Path, remap: Mapping[str, str]) -> None:
         self.path = path
-        self.intake = Intake()
+        self.intake = Intake(remap)
         self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
         self._options: str | None = None  # the last recorded ones
         self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON

@@ -11,7 +11,7 @@ that this package uses are kept; all others are counted and dropped as they come
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import stat
 from typing import Mapping
@@ -47,17 +47,19 @@ class Record:
     :param type: full name, ``package/msg/Type``.
     :param data: CDR bytes, with the encapsulation header.
     :param log_time: time of the recording [ns].
+    :param stands_for: the input topic as which the user wants it to be read; empty: its own name counts.
     """
 
     topic: str
     type: str
     data: bytes
     log_time: int
+    stands_for: str = ''
 
     @property
     def name(self) -> str:
-        """The last component of the topic's name."""
-        return self.topic.rsplit('/', 1)[-1]
+        """The last component of the topic's name, or the input topic for which it stands."""
+        return self.stands_for or self.topic.rsplit('/', 1)[-1]
 
     @property
     def namespace(self) -> str:
@@ -76,9 +78,11 @@ class Intake:
     :param records: the messages on topics that this package uses, as they came.
     :param counts: number of messages by (topic, type), also of those that are not kept.
     :param problems: one text for each defect.
+    :param remap: topic -> name of the input topic as which it is read.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, remap: Mapping[str, str]) -> None:
+        self.remap = remap
         self.records: list[Record] = []
         self.counts: Counter[tuple[str, str]] = Counter()
         self.problems: list[str] = []
@@ -115,18 +119,18 @@ class Intake:
     def keep(self, record: Record) -> None:
         """Keep a message; what the node sent takes at most half of the room."""
         limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
-        if record.name in OUTPUT_TYPES and (2 * len(self.records) >= limit or 2 * self._kept > KEPT_OCTETS):
+        if record.type in OUTPUT_TYPES.values() and (
+                2 * len(self.records) >= limit or 2 * self._kept > KEPT_OCTETS):
             return
         self._kept += len(record.data)
         if len(self.records) >= limit or self._kept > KEPT_OCTETS:
             raise LimitExceeded(f'it has more than {limit} messages or {KEPT_OCTETS / 1e6:.0f} MB '
                                 'on the topics of the calibrator')
-        self.records.append(record)
+        self.records.append(replace(record, stands_for=self.remap.get(record.topic, '')))
 
-
-def used(topic: str, kind: str) -> bool:
-    """Tell whether this package uses the messages on a topic, of type `kind`."""
-    return USED_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
+    def uses(self, topic: str, kind: str) -> bool:
+        """Tell whether this package uses the messages on a topic, of type `kind`."""
+        return USED_TYPES.get(self.remap.get(topic) or topic.rsplit('/', 1)[-1]) == kind
 
 
 def full_name(name: str) -> str:

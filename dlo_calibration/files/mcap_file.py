@@ -16,7 +16,7 @@ import struct
 from typing import BinaryIO, Callable, Iterator, Mapping
 from zlib import crc32
 
-from dlo_calibration.files.intake import full_name, Intake, LimitExceeded, NAME_LENGTH, Record, used
+from dlo_calibration.files.intake import full_name, Intake, LimitExceeded, NAME_LENGTH, Record
 from dlo_calibration.files.mcap_form import (
     CHANNEL,
     CHUNK,
@@ -43,16 +43,12 @@ LEFT_OUT = 10  # topics likewise
 
 @dataclass
 class _Channel:
-    """A topic of the file; `wanted`: its messages are kept."""
+    """A topic of the file; `wanted`: this package uses its messages, so that they are kept."""
 
     topic: str
     type: str
     encoding: str
-
-    @property
-    def wanted(self) -> bool:
-        """Whether this package uses its messages."""
-        return self.encoding == 'cdr' and used(self.topic, self.type)
+    wanted: bool
 
 
 class McapFile:
@@ -260,7 +256,8 @@ class McapFile:
             self._note('the description of a topic')
             return
         known = self._channels.get(number)
-        choice = [_Channel(topic, name, encoding) for name in self._schemas.get(schema, [''])]
+        choice = [_Channel(topic, name, encoding, encoding == 'cdr' and self._intake.uses(topic, name))
+                  for name in self._schemas.get(schema, [''])]
         found = next((one for one in choice if one.wanted), choice[0])
         if known is None or sure or found.wanted and not known.wanted:
             self._channels[number] = found

@@ -20,7 +20,7 @@ import numpy as np
 
 from dlo_calibration.calibration.file_options import file_options, FileOptions
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import DEFECT, InputError, told
+from dlo_calibration.errors import DEFECT, InputError, meant, one_of, told
 from dlo_calibration.files.bag import Bag, decode, encode
 from dlo_calibration.files.intake import Record
 from dlo_calibration.messages.codec import (
@@ -51,6 +51,17 @@ class Messages(Sequence[tuple[str, Any]]):
 
     def __init__(self, records: Sequence[Record] = ()) -> None:
         self._records = tuple(records)
+
+    @property
+    def renamed(self) -> tuple[Record, ...]:
+        """The records, those of remapped topics under names that need no remapping."""
+        home = next((one.namespace for one in self._records if not one.stands_for), '/calibrator')
+        return tuple(replace(one, topic=f'{home}/{one.name}', stands_for='') for one in self._records)
+
+    @property
+    def remapped(self) -> bool:
+        """Whether topics are read as others."""
+        return any(one.stands_for for one in self._records)
 
     def __len__(self) -> int:
         return len(self._records)
@@ -83,6 +94,7 @@ class Session:
     :param counts: number of recorded messages by topic, also of those that other programs use.
     :param duration: time from the first to the last of these [s].
     :param frames: the frame_ids of `messages`, sorted.
+    :param others: topics that are neither inputs nor outputs of the calibrator, and their types.
     """
 
     path: Path
@@ -94,6 +106,7 @@ class Session:
     counts: Mapping[str, int] = field(default_factory=dict)
     duration: float = 0.0
     frames: tuple[str, ...] = ()
+    others: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def options(self) -> Options:
@@ -215,21 +228,34 @@ def _same(one: Message, other: Message) -> bool:
     return bool(np.array_equal(a, b, equal_nan=True))
 
 
-def read_session(path: str | Path, namespace: str | None = None) -> Session:
+def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[str, str] | None = None,
+                 *, any_topics: bool = False) -> Session:
     """
     Read an MCAP file, a rosbag2 folder, or a .db3 file.
 
     Input topics are recognised by the last component of their name and by their type.
 
     :param namespace: of the input topics, e.g. ``/calibrator``; needed where several namespaces have them.
+    :param remap: topics with other names, and as which input each is read, e.g. ``{'/trackdlo/results_pc':
+        'goal_chain'}``; it then is the only topic of that kind.
+    :param any_topics: a session without any input topic is read, too.
     :raises InputError: where the session cannot be read, or has none of the input topics.
     """
-    path = Path(path)
-    source = Bag(path)
+    path, remap = Path(path), remap or {}
+    source = Bag(path, remap)
     source.read()
     records = tuple(sorted(source.records, key=lambda record: record.log_time))
     recorded, problems = source.options(), source.problems
-    topics = _input_topics(path, sorted(source.intake.counts), namespace, problems)
+    seen = sorted(source.intake.counts)
+    _check_remap(remap, dict(seen))
+    try:
+        topics = _input_topics(path, seen, namespace, remap, problems)
+    except InputError as error:
+        if not any_topics or not seen or any(INPUT_TYPES.get(topic.rsplit('/', 1)[-1]) == kind
+                                             for topic, kind in seen):
+            raise
+        topics = frozenset()
+        problems.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
     used = source.used(inputs)
@@ -245,7 +271,8 @@ def read_session(path: str | Path, namespace: str | None = None) -> Session:
     allowed = file_options(recorded or {}, path if path.is_dir() else path.parent)
     return Session(path, messages, records, None if recorded is None else dict(allowed.values),
                    counted(map(told, [*problems, *allowed.problems])), allowed.refusal, counts,
-                   source.intake.duration, frames)
+                   source.intake.duration, frames,
+                   {topic: kind for topic, kind in seen if not source.intake.uses(topic, kind)})
 
 
 def _checked(records: Iterable[Record], problems: list[str]) -> tuple[Messages, tuple[str, ...]]:
@@ -267,28 +294,45 @@ def _checked(records: Iterable[Record], problems: list[str]) -> tuple[Messages, 
     return Messages(good), tuple(sorted(frames))
 
 
+def _check_remap(remap: Mapping[str, str], seen: Mapping[str, str]) -> None:
+    """Refuse topics that are not in a session, or cannot be what they are remapped to."""
+    for topic, kind in remap.items():
+        if topic not in seen:
+            raise InputError(f'topic {topic} to read as {kind}', 'no such topic', one_of(seen, topic),
+                             meant(topic, seen, 'correct the name; dlo-calibration info lists the topics'))
+        if seen[topic] != INPUT_TYPES[kind]:
+            raise InputError(f'topic {topic} to read as {kind}', f'a {seen[topic]}',
+                             f'a {INPUT_TYPES[kind]}', 'name another topic; dlo-calibration info lists them')
+
+
 def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | None,
-                  problems: list[str]) -> frozenset[str]:
+                  remap: Mapping[str, str], problems: list[str]) -> frozenset[str]:
     """Return the topics to read, at most one for each kind of message; `seen` has topics and their types."""
-    found: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES}
+    found: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES if kind not in remap.values()}
     for record in (Record(topic, kind, b'', 0) for topic, kind in seen):
+        if record.topic in remap:
+            continue
+        if record.name in remap.values():
+            problems.append(f'topic {record.topic} is left out, as another one is read as {record.name}')
+            continue
         if record.type == INPUT_TYPES.get(record.name):
             if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
                 found[record.name].append(record)
         elif record.name in INPUT_TYPES:
             problems.append(f'topic {record.topic} is left out: it is a {record.type}, '
                             f'not a {INPUT_TYPES[record.name]}')
-    if not any(found.values()):
+    if not (remap or any(found.values())):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
             f'session {path}', f'{held} ({problems[-1]})' if problems else held,
             'at least one of ' + ', '.join(f'{kind} ({text})' for kind, text in INPUT_TYPES.items())
             + ('' if namespace is None else f' in namespace {namespace}'),
-            'record the topics of the calibrator' if namespace is None else 'correct the namespace')
+            'record these topics, or name others with --remap TOPIC:=goal_chain' if namespace is None else
+            'correct the namespace')
     if any(len(choice) > 1 for choice in found.values()):
         spaces = sorted({record.namespace or '/' for choice in found.values() for record in choice})
         complete = [space for space in spaces
-                    if all((space.rstrip('/')) in {r.namespace for r in choice} for choice in found.values())]
+                    if all(space.rstrip('/') in {r.namespace for r in choice} for choice in found.values())]
         if len(complete) != 1:
             raise InputError(
                 f'session {path}', f'input topics in the namespaces {", ".join(spaces)}',
@@ -296,4 +340,4 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
         problems.append(f'topics outside the namespace {complete[0]} are left out')
         found = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
                  for kind, choice in found.items()}
-    return frozenset(record.topic for choice in found.values() for record in choice)
+    return frozenset([*remap, *(record.topic for choice in found.values() for record in choice)])

@@ -10,7 +10,7 @@ import sqlite3
 from typing import Iterator
 from urllib.parse import quote
 
-from dlo_calibration.files.intake import full_name, Intake, NAME_LENGTH, Record, used
+from dlo_calibration.files.intake import full_name, Intake, NAME_LENGTH, Record
 from dlo_calibration.files.unpacking import AT_ONCE, unpacked_message
 
 PAGES = 100  # damaged ones that are gone around; more are hardly a recording
@@ -65,7 +65,7 @@ def _read(connection: sqlite3.Connection, name: str, intake: Intake) -> None:
         intake.problems.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr{more}')
     count, pages = 0, 0
     for row in _rows(connection, [number for number, (topic, kind, encoding) in topics.items()
-                                  if encoding == 'cdr' and used(topic, kind)]):
+                                  if encoding == 'cdr' and intake.uses(topic, kind)]):
         if row is None:
             pages += 1
             continue

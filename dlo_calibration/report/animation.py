@@ -63,16 +63,17 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path,
 
 
 def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],
-                     folder: Path, note: Callable[[str], None]) -> list[Path]:
+                     folder: Path, note: Callable[[str], None], numbers: Sequence[int]) -> list[Path]:
     """
     Simulate trials and write ``trial_1.gif``, ``trial_2.gif``, ... into a folder, which is created.
 
     :param physical: parameters by name (SI units).
     :param note: called with the path of each file after it was written.
+    :param numbers: of the trials.
     :raises DloCalibrationError: if files cannot be written; the others are.
     :raises SimulationError: if a trial cannot be simulated.
     """
-    paths, attempts = numbered(trials, folder, '.gif'), Attempts(folder)
+    paths, attempts = numbered(numbers, folder, '.gif'), Attempts(folder)
     for trial, path in zip(trials, paths, strict=True):
         motion = simulated_motion(trial, simulator, physical)
         with attempts.attempt(path.name):

@@ -118,14 +118,15 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
 
 
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,
-                   note: Callable[[str], None]) -> list[Path]:
+                   note: Callable[[str], None], numbers: Sequence[int]) -> list[Path]:
     """
     Write ``trial_1.png``, ``trial_2.png``, ... into a folder, which is created; see `session_picture`.
 
     :param note: called with the path of each file after it was written.
+    :param numbers: of the trials.
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
-    paths, attempts = numbered(trials, folder, '.png'), Attempts(folder)
+    paths, attempts = numbered(numbers, folder, '.png'), Attempts(folder)
     for k, (trial, path) in enumerate(zip(trials, paths, strict=True)):
         with attempts.attempt(path.name):
             session_picture([trial], None if chains is None else [chains[k]], path)
@@ -134,10 +135,10 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
     return paths
 
 
-def numbered(trials: Sequence[Trial], folder: Path, suffix: str) -> list[Path]:
+def numbered(numbers: Sequence[int], folder: Path, suffix: str) -> list[Path]:
     """Return a path for each trial, numbered because names may contain anything; create the folder."""
     make_folder(folder)
-    return [folder / f'trial_{k}{suffix}' for k in range(1, len(trials) + 1)]
+    return [folder / f'trial_{number}{suffix}' for number in numbers]
 
 
 def trial_panels(drawn: Drawn) -> list[Panel]:

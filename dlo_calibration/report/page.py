@@ -55,10 +55,10 @@ class Origin:
     problems: Sequence[str] = ()
 
 
-def repeating_command(session: str, options: Options) -> str:
-    """Return the command that calibrates on a session with these options."""
+def repeating_command(session: str, options: Options, selection: Sequence[str] = ()) -> str:
+    """Return the command that calibrates on a session with these options, and flags that select trials."""
     changed = recordable(_changed(options))
-    return shlex.join(['dlo-calibration', 'fit', session,
+    return shlex.join(['dlo-calibration', 'fit', session, *selection,
                        *(word for name, value in changed.items() for word in as_flags(name, value))])
 
 

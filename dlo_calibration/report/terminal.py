@@ -208,18 +208,24 @@ def print_result(result: CalibrationResult, stream: TextIO,
 
 def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     """Print the JSON document of `info` as tables."""
-    out = console(stream)
+    out, unknown = console(stream), {one['topic']: one for one in about['unknown_topics']}
     out.print(facts_table(about['session'], [
         ('trials', str(len(about['trials']))),
         ('duration', f"{number(about['duration_s'])} s"),
         ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
-        *((topic, f'{count} messages') for topic, count in about['messages'].items()),
+        *((topic, f'{count} messages') for topic, count in about['messages'].items() if topic not in unknown),
         ('calibrate', about['choice'] or ', '.join(about['calibrate'])),
     ]))
+    if unknown:
+        keys = ('topic', 'type', 'messages')
+        out.print(rows_table('topics that the calibrator does not know', keys, [
+            [str(one[key]) for key in keys] for one in unknown.values()]))
+    for one in filter(lambda one: one['hint'], unknown.values()):
+        out.print(escape(f'hint: {one["hint"]}'), soft_wrap=True)
     if about['trials']:
-        head = ('name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')
+        head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')
         out.print(rows_table('trials', head, [
-            (trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
+            (str(trial['number']), trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
              ', '.join(f"{shortened(hand['name'], 100)} (points {' '.join(map(str, hand['grips']))})"
                        for hand in trial['hands']),
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
