@@ -26,7 +26,7 @@ SHARED = ('errors', 'signals', 'writing')
 ONLY = {
     'aiohttp': ('capture/events.py', 'capture/guard.py', 'capture/server.py'),
     'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
-    'pybullet': ('simulation/bullet.py', 'simulation/window.py'),
+    'pybullet': ('simulation/bullet_world.py', 'simulation/window.py'),
     'cv2': ('capture',),
     'PIL': ('capture',),
     'numba': ('simulation/kernels.py', 'capture/path.py'),

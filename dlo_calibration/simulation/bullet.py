@@ -11,46 +11,20 @@ friction with all other bodies.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-import ctypes
-import os
-from tempfile import gettempdir, NamedTemporaryFile
-from typing import Any, Iterator, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.bullet_world import add_obstacle, Gripper, pybullet
 from dlo_calibration.simulation.engine import Engine
-from dlo_calibration.simulation.mesh import stl_octets
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene
 from dlo_calibration.simulation.protocol import advanced, DEFAULT_NODES
 from dlo_calibration.simulation.rope import diverged, Rope
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep native code from writing to stdout and stderr."""
-    flush = ctypes.CDLL(None).fflush  # of C, which buffers output to a pipe
-    flush(None)
-    kept, nowhere = (os.dup(1), os.dup(2)), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
-    try:
-        yield
-    finally:
-        flush(None)
-        for stream, before in enumerate(kept, 1):
-            os.dup2(before, stream)
-            os.close(before)
-        os.close(nowhere)
-
-
-with _silence():  # at import it prints its build time, also in the middle of a progress bar
-    import pybullet as pybullet  # so that `window` can use it
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
 
@@ -96,6 +70,9 @@ class BulletRope:
             for point in np.asarray(points, dtype=float))
         for body in self.bodies:
             pybullet.setCollisionFilterGroupMask(body, -1, group, ~group, physicsClientId=client)
+        self._held: tuple[int, ...] = ()
+        self._grippers: list[Gripper] = []
+        self._leaving: list[Gripper] = []  # that have opened, and may still be around the rope
         self.reset(places, points, physical, velocities, features, directions)
 
     @classmethod
@@ -114,6 +91,8 @@ class BulletRope:
         velocities = np.zeros((len(places), 3)) if velocities is None else velocities
         self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features,
                           directions)
+        self.release()
+        self.hold(())
         state = self._rope.state
         for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
             pybullet.changeDynamics(
@@ -121,7 +100,6 @@ class BulletRope:
                 localInertiaDiagonal=[1e6] * 3,  # kg m^2: so large that spheres slide and do not roll
                 restitution=0.0, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client)
             pybullet.resetBasePositionAndOrientation(body, point, IDENTITY, physicsClientId=self._client)
-        self.hold(())
 
     @property
     def points(self) -> Floats:
@@ -129,8 +107,52 @@ class BulletRope:
         return self._rope.points
 
     def hold(self, nodes: Sequence[int]) -> None:
-        """Hold exactly these nodes from now on; an empty sequence releases the rope."""
-        self._rope.hold(tuple(dict.fromkeys(int(node) for node in nodes)))
+        """
+        Hold exactly these nodes from now on, besides those in grippers; an empty sequence lets go of them.
+
+        They still touch whatever is there.  For a robot that holds the rope, `grip` is better.
+
+        :raises InputError: if a gripper holds one of them.
+        """
+        nodes = tuple(dict.fromkeys(int(node) for node in nodes))
+        gripped = {node for one in self._grippers for node in one.nodes}.intersection(nodes)
+        if gripped:
+            raise InputError('hold', f'the nodes {sorted(gripped)}, which a gripper holds', 'free nodes',
+                             'release the gripper first')
+        self._held = nodes
+        self._hold_all()
+
+    def grip(self, body: int, link: int, place: Sequence[float] = (0.0, 0.0, 0.0), *, nodes: int = 2,
+             reach: float = 0.03) -> None:
+        """
+        Let a gripper of a robot hold the rope where it is; in each step, the rope follows the gripper.
+
+        The rope does not touch the hand, i.e. this link with all links that are fixed to it or that it
+        moves, until it is released and the hand has moved away.  It touches all other links.
+
+        :param body: PyBullet's id of the robot.
+        :param link: index of a link of the hand; -1: the base.
+        :param place: (3,) [m] between the fingers, in the frame of that link (in URDF: of its joint).
+        :param nodes: number of nodes next to this place that are held; 1: the rope turns freely about it;
+            2: the gripper keeps the direction of the rope, too.
+        :param reach: largest distance [m] between the place and the rope.
+        :raises InputError: if the rope is further away, or held there already.
+        """
+        gripper = Gripper(self._client, body, link, place)
+        gripper.close(self._rope.points, self._rope.state.rod.held.tolist(), nodes, reach)
+        gripper.touch(self.bodies, False)
+        self._grippers.append(gripper)
+        self._hold_all()
+
+    def release(self, body: int | None = None, link: int | None = None) -> None:
+        """Open the gripper at a link of a robot; None: all of the robot, or of all robots."""
+        opened = [one for one in self._grippers if body in (None, one.body) and link in (None, one.link)]
+        self._grippers = [one for one in self._grippers if one not in opened]
+        self._leaving += opened
+        self._hold_all()
+
+    def _hold_all(self) -> None:
+        self._rope.hold((*self._held, *(node for one in self._grippers for node in one.nodes)))
         self._targets = self._rope.state.points[self._rope.state.rod.held]
 
     @property
@@ -148,22 +170,35 @@ class BulletRope:
         """
         Give the nodes the velocities due to internal forces, gravity and self-contact.
 
-        :param targets: (h, 3) [m] positions of the held nodes after the step;
-            None: they stay.
-        :param turns: (h, 9) rotation matrices, row by row, by which the clamps that hold the nodes turn in
+        :param targets: (h, 3) [m] positions after the step of the nodes that `hold` holds;
+            None: they stay.  Nodes in a gripper go to where the gripper is now.
+        :param turns: (h, 9) rotation matrices, row by row, by which the clamps that hold these nodes turn in
             this step; None: a clamp turns with its segment, and not about it.
         :raises SimulationError: if the rollout diverges.
         """
         state = self._rope.state
         if targets is not None:
-            self._targets = np.array(targets, dtype=float)
+            self._targets[:len(self._held)] = targets
         turned = np.empty((0, 0)) if turns is None else np.ascontiguousarray(turns, dtype=float)
+        if self._grippers:
+            turned = self._follow(turned)
         if not kernels.predict_velocities(state, self._targets, turned):
             raise diverged()
         sent = state.predicted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client
         for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
             pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
+
+    def _follow(self, turns: Floats) -> Floats:
+        """Move the nodes in grippers with them; return `turns` (h, 9) of all held nodes."""
+        count = len(self._held)
+        all_turns = [turns if len(turns) else np.tile(np.eye(3).ravel(), (count, 1))]
+        for gripper in self._grippers:
+            there, turn = gripper.follow()
+            self._targets[count:count + len(there)] = there
+            all_turns.append(np.tile(turn.ravel(), (len(there), 1)))
+            count += len(there)
+        return np.concatenate(all_turns)
 
     def after_step(self) -> None:
         """Read positions and velocities after contact from Bullet."""
@@ -176,6 +211,10 @@ class BulletRope:
         state.velocities[:] = (points - state.points) / self.time_step
         state.support[:] = state.velocities - state.predicted
         state.points[:] = points
+        for gripper in [one for one in self._leaving if one.is_clear_of(points, self._radius)]:
+            self._leaving.remove(gripper)
+            if not any(one.shares_links_with(gripper) for one in (*self._grippers, *self._leaving)):
+                gripper.touch(self.bodies, True)
 
     def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
         """Take k steps; see `rollout.Stepper.advance`."""
@@ -189,49 +228,6 @@ class BulletRope:
         """Take the rope out of the world."""
         for body in self.bodies:
             pybullet.removeBody(body, physicsClientId=self._client)
-
-
-def add_obstacle(client: int, obstacle: Obstacle) -> None:
-    """
-    Add an obstacle to a world.
-
-    :raises DloCalibrationError: if a mesh cannot be handed over.
-    """
-    sizes = obstacle.sizes.tolist()
-    with _file_of(obstacle.triangles) as file:
-        shape = pybullet.createCollisionShape(physicsClientId=client, **{
-            'box': {'shapeType': pybullet.GEOM_BOX, 'halfExtents': [size / 2 for size in sizes]},
-            'sphere': {'shapeType': pybullet.GEOM_SPHERE, 'radius': sizes[0]},
-            'cylinder': {'shapeType': pybullet.GEOM_CYLINDER, 'height': sizes[0], 'radius': sizes[-1]},
-            'capsule': {'shapeType': pybullet.GEOM_CAPSULE, 'height': sizes[0], 'radius': sizes[-1]},
-            'mesh': {'shapeType': pybullet.GEOM_MESH, 'fileName': file, 'meshScale': sizes,
-                     'flags': pybullet.GEOM_FORCE_CONCAVE_TRIMESH},
-        }[obstacle.shape])
-    body = pybullet.createMultiBody(
-        0, shape, basePosition=obstacle.position.tolist(), baseOrientation=obstacle.turn.tolist(),
-        useMaximalCoordinates=True, physicsClientId=client)
-    pybullet.changeDynamics(body, -1, lateralFriction=obstacle.friction, restitution=0.0,
-                            physicsClientId=client)
-
-
-@contextmanager
-def _file_of(triangles: Floats) -> Iterator[str]:
-    """
-    Give the path of a file with checked triangles, for a while; empty if there are none.
-
-    PyBullet takes arrays, too, but does not free them with the world.
-    """
-    if not len(triangles):
-        yield ''
-        return
-    try:
-        with NamedTemporaryFile(prefix='dlo_mesh_', suffix='.stl') as file:
-            file.write(stl_octets(triangles))
-            file.flush()
-            yield file.name
-    except OSError as error:
-        raise DloCalibrationError(f'a mesh of the scene could not be handed to PyBullet ({error}); '
-                                  f'free space in {gettempdir()}') from error
 
 
 class BulletSimulator(Engine):

@@ -22,7 +22,8 @@ import numpy as np
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.chain import Floats, interpolation_matrix
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.bullet import add_obstacle, IDENTITY, pybullet
+from dlo_calibration.simulation.bullet import IDENTITY
+from dlo_calibration.simulation.bullet_world import add_obstacle, pybullet
 from dlo_calibration.simulation.motion import hands_at, Motion
 from dlo_calibration.simulation.obstacles import read_scene
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The examples do what they say, with the nodes."""
+"""The examples do what they say."""
 
 import os
 from pathlib import Path
@@ -19,11 +19,11 @@ PATIENCE = 60.0  # s
 
 
 def example(environment, name, *words):
-    """Execute an example; return what it logs."""
+    """Execute an example; return what it logs or prints."""
     done = subprocess.run([sys.executable, ROOT / 'examples' / name, *words], text=True, capture_output=True,
                           env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
-    return done.stderr
+    return done.stderr + done.stdout
 
 
 def test_robot_session_sends_a_trial_starts_and_hears_the_result(ros_environment, tmp_path):
@@ -58,3 +58,11 @@ def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environmen
     assert predicted < 12 and after < 12
     assert abs(after - predicted) < 2
     assert 'the planner says: The DLO is at the goal already' in heard
+
+
+def test_robot_arm_carries_the_rope_without_stretching_it():
+    heard = example(dict(os.environ), 'robot_arm.py', '--pace', '4')
+    largest, = re.findall(r'The largest stretch was ([\d.]+) %', heard)
+    assert 0 < float(largest) < 5
+    lifted, = re.findall(r'It was lifted by (\d+) mm', heard)
+    assert int(lifted) > 250

@@ -14,8 +14,7 @@ import pybullet
 import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError, Trial
-from dlo_calibration.simulation import bullet
-from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator
+from dlo_calibration.simulation.bullet import BulletRope, BulletSimulator, IDENTITY
 
 GRAVITY = 9.81
 STIFF = {'flexibility': 1e-3, 'elasticity': 1e4, 'friction': 0.4, 'self_collision': 0.005, 'mass': 0.05,
@@ -190,7 +189,7 @@ def test_a_mesh_does_the_same_as_with_pybullets_own_reader(scene, monkeypatch):
         return shape_of(*plane, **{**shape, **({'fileName': file} if 'fileName' in shape else {})})
 
     for make in (shape_of, theirs):
-        monkeypatch.setattr(bullet.pybullet, 'createCollisionShape', make)
+        monkeypatch.setattr(pybullet, 'createCollisionShape', make)
         simulator = BulletSimulator(scene=path, settle_limit=1.0)
         found.append(simulator.simulate(dropped(0.25), PHYSICAL).chains)
         simulator.close()
@@ -229,3 +228,99 @@ def test_a_scene_stands_where_pybullets_own_importer_puts_it(scene, capfd):
     assert (hits[0] < 1).sum() > 100
     # Their cylinder has corners, so that a few rays that graze it pass.
     assert (np.abs(hits[0] - hits[1]) > 0.01).mean() < 0.005
+
+
+def hand(client, places=((0, 0, 0),)):
+    """Add a body without weight, of blocks of 8 cm; it moves only where a test puts it."""
+    block = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.04] * 3, physicsClientId=client)
+    count = len(places) - 1
+    return pybullet.createMultiBody(
+        0, block, basePosition=places[0], linkMasses=[0] * count, linkCollisionShapeIndices=[block] * count,
+        linkVisualShapeIndices=[-1] * count, linkPositions=list(places[1:]),
+        linkOrientations=[IDENTITY] * count, linkInertialFramePositions=[(0, 0, 0)] * count,
+        linkInertialFrameOrientations=[IDENTITY] * count, linkParentIndices=[0] * count,
+        linkJointTypes=[pybullet.JOINT_FIXED] * count, linkJointAxis=[(0, 0, 1)] * count,
+        physicsClientId=client)
+
+
+def put(client, body, place, turn=IDENTITY):
+    pybullet.resetBasePositionAndOrientation(body, place, turn, physicsClientId=client)
+
+
+def stretch(rope, begun):
+    """Return the largest factor by which a segment is longer than in (N, 3) `begun`."""
+    return (np.linalg.norm(np.diff(rope.points, axis=0), axis=1)
+            / np.linalg.norm(np.diff(begun, axis=0), axis=1)).max()
+
+
+def test_a_gripper_holds_the_rope_inside_of_a_link_without_stretching_it(world):
+    """Lift an end by 0.3 m, held in the middle of a block, and let go of it there."""
+    table(world)
+    rope = BulletRope.of(world, Chain(line((0, 0, 0.005), (1, 0, 0), 0.6, 21)), PHYSICAL)
+    begun, largest = rope.points, 0.0
+    body = hand(world, [begun[0] + (0, 0, 0.3), (0, 0, -0.3)])  # it holds with its second block
+    rope.grip(body, 0)
+    for height in np.linspace(0, 0.3, 150):
+        put(world, body, begun[0] + (0, 0, 0.3 + height))
+        rope.step()
+        largest = max(largest, stretch(rope, begun))
+        assert rope.points[:2, 2] == pytest.approx(0.005 + height, abs=1e-6)  # both: a clamp
+    assert largest < 1.03  # with `hold`, the block pushes the neighbours away, to 4
+    rope.release(body)
+    for _ in range(20):
+        rope.step()
+        largest = max(largest, stretch(rope, begun))
+    assert largest < 1.1  # the clamp was rigid, so that the end springs back
+    assert np.linalg.norm(rope.points[0] - begun[0] - (0, 0, 0.3)) < 0.03  # nothing pushes it out
+
+
+def test_what_a_gripper_let_go_touches_it_again_once_it_was_clear(world):
+    rope = BulletRope.of(world, Chain(line((0, 0, 0.3), (1, 0, 0), 0.06, 5)), PHYSICAL, nodes=5)
+    body = hand(world, [(0.03, 0, 0.3)])
+    rope.grip(body, -1, (-0.03, 0, 0))
+    rope.release()
+    rope.step()
+    assert rope.points[:, 2].mean() == pytest.approx(0.3, abs=1e-3)  # still inside
+    put(world, body, (0.03, 0, 0.2))
+    for _ in range(200):
+        rope.step()
+    assert rope.points[:, 2] == pytest.approx(0.245, abs=2e-3)  # it lies on the block
+
+
+def test_a_gripper_turns_a_rope_that_resists_twist_about_its_axis(world):
+    """It is the same as `hold` with the turns of the hand."""
+    twisting = {**PHYSICAL, 'torsion': 1e-4, 'natural_curvature': 5.0}
+    found = []
+    for gripped in (False, True):
+        rope = BulletRope.of(world, Chain(line((0, 0, 1), (1, 0, 0), 0.3, 11)), twisting, nodes=11,
+                             group=1 << (6 + gripped))
+        begun = rope.points
+        body = hand(world, [(-0.5, 0, 1)])
+        if gripped:
+            rope.grip(body, -1, (0.5, 0, 0))
+        else:
+            rope.hold((0, 1))
+        for k in range(40):
+            turn = pybullet.getQuaternionFromEuler((0.05 * (k + 1), 0, 0))
+            each = np.array(pybullet.getMatrixFromQuaternion(pybullet.getQuaternionFromEuler((0.05, 0, 0))))
+            if gripped:
+                put(world, body, (-0.5, 0, 1), turn)
+                rope.step()
+            else:
+                rope.step(begun[:2], np.array([each, each]))
+        found.append(rope.points)
+        rope.remove()
+    np.testing.assert_allclose(*found, atol=1e-6)
+    assert np.ptp(found[0][:, 1]) > 1e-3  # it was turned aside
+
+
+def test_a_gripper_away_from_the_rope_is_refused(world):
+    rope = BulletRope.of(world, Chain(line((0, 0, 0), (1, 0, 0), 0.6, 11)), PHYSICAL)
+    body = hand(world, [(0, 0, 0.2)])
+    with pytest.raises(InputError, match='a rope that is 200 mm away from it, expected at most 30 mm'):
+        rope.grip(body, -1)
+    rope.grip(body, -1, (0, 0, -0.2))
+    with pytest.raises(InputError, match='held already'):
+        rope.grip(body, -1, (0, 0, -0.2))
+    with pytest.raises(InputError, match='release the gripper first'):
+        rope.hold((1, 5))

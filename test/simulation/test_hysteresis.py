@@ -12,7 +12,8 @@ from test_rod import crumpled, energy, FREE, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation import kernels
-from dlo_calibration.simulation.bullet import BulletRope, pybullet
+from dlo_calibration.simulation.bullet import BulletRope
+from dlo_calibration.simulation.bullet_world import pybullet
 from dlo_calibration.simulation.compiled import CompiledRope
 from dlo_calibration.simulation.rod import RodProperties
 
