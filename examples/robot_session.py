@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A robot program that calibrates a DLO: it sends one trial, starts the calibration, and logs the result.
+A robot program that calibrates a DLO: it sends four trials, starts the calibration, and logs the result.
 
-    ros2 run dlo_calibration calibrator --ros-args -p mass:=0.03
+    ros2 run dlo_calibration calibrator --ros-args -p mass:=0.02
     python3 examples/robot_session.py
 
-Replace `observed` by your camera, and `move` by the motion of your robot.
+Robot and camera are played here from a sample, a recorded session of an elastic rope of 20 g.  Replace
+`observed` by your camera, and `move` by the motion of your robot.
 """
 
+from pathlib import Path
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -22,40 +24,58 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from dlo_calibration import read_session
+
 FRAME = 'table'  # the same in all messages; its z axis points up
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # as the calibrator publishes
+PLAYED = read_session(Path(__file__).resolve().parents[1] / 'msg_samples' / 'object4').trials
 
 
-def observed(moved):
-    """Return the points along the DLO, (n, 3) [m]; here, invented ones of a DLO on a table."""
-    along = np.linspace(0, 0.6, 13)
-    aside = 0.1 * np.exp(-along / 0.2) if moved else 0 * along
-    return np.stack([along, aside, 0 * along + 0.004], axis=1)
+def observed(number, moved):
+    """Return what the camera sees before and after trial `number`: the points along the DLO, (n, 3) [m]."""
+    trial = PLAYED[number]
+    return trial.goals[-1].chain.points if moved else trial.initial.points
 
 
-def move(gripper):
-    """Return times [s] and positions [m] of the gripper, which closes at the first and opens at the last."""
-    return zip((0.0, 0.3, 0.7, 1.0), gripper + np.array(
-        [(0, 0, 0), (0, 0, 0.05), (0, 0.1, 0.05), (0, 0.1, 0)]), strict=True)
+def move(number):
+    """
+    Do the action of trial `number`.
+
+    :returns: for each hand, its times [s] and positions [m], from where it closes to where it opens; and for
+        each point the number of the hand that holds it afterwards, 0 if none does.
+    """
+    trial = PLAYED[number]
+    time.sleep(trial.goals[-1].time)  # the robot moves, and the DLO comes to rest
+    held = np.zeros(len(trial.initial.points), int)
+    for k, hand in enumerate(trial.hands, 1):
+        if trial.holds(hand, trial.goals[-1]):
+            held[list(hand.grips)] = k
+    return [(hand.times, hand.positions) for hand in trial.hands], held
 
 
-def chain(points, stamp):
+def chain(points, stamp, held=None):
     """Return the message of a chain; all chains of a trial have the same points in the same order."""
-    cloud = PointCloud2(height=1, width=len(points), point_step=12, row_step=12 * len(points), is_dense=True)
+    cloud = PointCloud2(height=1, width=len(points), point_step=13, row_step=13 * len(points), is_dense=True)
     cloud.header.frame_id, cloud.header.stamp = FRAME, stamp.to_msg()
-    cloud.fields = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
-                    for k, name in enumerate('xyz')]
-    cloud.data = np.asarray(points, '<f4').tobytes()
+    cloud.fields = [*(PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+                      for k, name in enumerate('xyz')),
+                    PointField(name='hand', offset=12, datatype=PointField.UINT8, count=1)]
+    packed = np.zeros(len(points), [('xyz', '<f4', 3), ('hand', 'u1')])
+    packed['xyz'], packed['hand'] = points, 0 if held is None else held
+    cloud.data = packed.tobytes()
     return cloud
 
 
-def action(waypoints, stamp):
-    """Return the action of one hand, which grips the point of the chain nearest to its first waypoint."""
-    message = MultiDOFJointTrajectory(joint_names=['left_hand'])
+def action(hands, stamp):
+    """Return the action of hands, each of which grips the point nearest to its first waypoint."""
+    message = MultiDOFJointTrajectory(joint_names=[f'hand_{k}' for k in range(1, len(hands) + 1)])
     message.header.frame_id, message.header.stamp = FRAME, stamp.to_msg()
-    for seconds, (x, y, z) in waypoints:
+    times = np.unique(np.concatenate([times for times, _ in hands]))
+    for seconds in times:
+        places = [[np.interp(seconds, own, positions[:, axis]) for axis in range(3)]
+                  for own, positions in hands]
         message.points.append(MultiDOFJointTrajectoryPoint(
-            transforms=[Transform(translation=Vector3(x=x, y=y, z=z))],
+            transforms=[Transform(translation=Vector3(x=x, y=y, z=z)) for x, y, z in places],
             time_from_start=Duration(seconds=seconds).to_msg()))
     return message
 
@@ -66,7 +86,7 @@ def values(message, name):
 
 
 def main():
-    """Send a trial, calibrate, and log what was found."""
+    """Send the trials, calibrate, and log what was found."""
     rclpy.init()
     node = rclpy.create_node('robot')
     log, heard = node.get_logger(), {}
@@ -88,21 +108,25 @@ def main():
     log.info('waiting for the calibrator')
     wait(lambda: 'status' in heard and start.service_is_ready() and all(
         one.get_subscription_count() for one in (initial, hands, goal)))
-    before = status('trials'), status('last_refusal')
-    points, begun = observed(moved=False), node.get_clock().now()
-    initial.publish(chain(points, begun))
-    hands.publish(action(move(points[0]), begun))
-    time.sleep(1.5)  # the robot moves, and the DLO comes to rest
-    goal.publish(chain(observed(moved=True), node.get_clock().now()))
-    wait(lambda: (status('trials'), status('last_refusal')) != before)
+    for number in range(len(PLAYED)):
+        before = status('trials'), status('last_refusal')
+        initial.publish(chain(observed(number, moved=False), node.get_clock().now()))
+        begun = node.get_clock().now()
+        paths, held = move(number)
+        hands.publish(action(paths, begun))
+        goal.publish(chain(observed(number, moved=True), node.get_clock().now(), held))
+        wait(lambda before=before: (status('trials'), status('last_refusal')) != before)
+        log.info(f'trials: {status("trials")}; last refusal: {status("last_refusal") or "none"}')
     heard.clear()  # an earlier calibration may have left a result
     answer = start.call_async(Trigger.Request())
     wait(answer.done)
     log.info(answer.result().message)
     if answer.result().success:
         wait(lambda: 'result' in heard or 'status' in heard and status('state') == 'failed')
-        for one in heard['result'].status if 'result' in heard else ():
+        for one in heard['result'].status if 'result' in heard else heard['status'].status:
             log.info(f'{one.name}: {one.message}')
+        if 'result' in heard:
+            log.info(values(heard['result'], 'calibration')['findings'])
     rclpy.shutdown()
 
 
