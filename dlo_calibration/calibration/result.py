@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Mapping, Sequence
 
 import numpy as np
@@ -23,7 +23,7 @@ from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import ParameterSpace, SCALE
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Trial
 
@@ -37,7 +37,7 @@ class ParameterEstimate:
     `physical_lower` and `physical_upper` are the same in `physical_unit`.
 
     :param identifiable: False if the trials do not determine the value.
-    :param verdict: identifiable, weak, or not identifiable; see `uncertainty`.
+    :param verdict: identifiable, weak, or not identifiable, by the width of the interval; see `uncertainty`.
     :param note: a remark for the user; may be empty.
     """
 
@@ -92,8 +92,8 @@ class CalibrationResult:
         trials, best, examination = setting.trials, found.best, found.examination
         uncertainty = spread_of_best(found.evaluations, best.point)
         if examination is not None:
-            uncertainty = examination.uncertainty if examination.regular else replace(
-                uncertainty, excited=examination.uncertainty.excited)
+            uncertainty = examination.uncertainty if examination.regular else uncertainty.of_excited(
+                examination.uncertainty.excited)
         return cls(
             space=found.space, best=best, trials=trials,
             parameters=parameter_estimates(found.space, best, uncertainty, known.guessed),
@@ -168,12 +168,16 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, found: Uncertai
             note = 'no trial shows it; it keeps its default'
             if name in guessed:
                 note = 'no trial shows it; estimated from the height at which the DLO lies'
-        if found.at_bound[k]:
-            note = 'at the end of its scale; the best value may lie beyond'
+        low, high = sorted((at_lower, at_upper))
         verdict = found.verdicts[k]
+        if found.excited[k] and (lower <= 0) != (upper >= SCALE):
+            words = BY_NAME[name].interval(lower, upper, (low, high), unit)
+            note = f'{words}: the interval reaches the end of the scale'
+            if found.at_bound[k]:
+                note += ', where the best value is'
         parameters[name] = ParameterEstimate(
-            name, value, float(found.std[k]) * SCALE, lower, upper, at_value, min(at_lower, at_upper),
-            max(at_lower, at_upper), unit, verdict == IDENTIFIABLE, verdict, note)
+            name, value, float(found.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
+            verdict == IDENTIFIABLE, verdict, note)
     return parameters
 
 

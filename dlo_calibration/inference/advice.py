@@ -28,7 +28,7 @@ from dlo_calibration.evaluation.linearisation import (
     STEP,
     WIDEST,
 )
-from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_STD, Uncertainty
+from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, NamedAction, TwoHands
@@ -101,7 +101,7 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     sought: set[int] = set()
     for k in np.argsort(-uncertainty.std, kind='stable').tolist():
         now = float(uncertainty.std[k])
-        if now < IDENTIFIABLE_STD or len(sought) == MOST_SOUGHT:
+        if 2 * DEVIATIONS * now <= IDENTIFIABLE_WIDTH or len(sought) == MOST_SOUGHT:
             return None
         alone = np.arange(space.dimension) == k
         promising: list[tuple[float, Candidate, Floats]] = []

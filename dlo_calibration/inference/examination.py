@@ -157,7 +157,7 @@ def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
 
     The effect of a stiffness fades as it grows: one end of an interval may fit clearly worse, the other not.
     An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
-    after that, it is the end of the scale.
+    after that, it is the end of the scale.  The standard deviations grow with them.
     """
     point, ends, limits = fit.point, np.stack([found.lower, found.upper]), (0.0, 1.0)
     excited = np.flatnonzero(found.excited)
@@ -182,7 +182,7 @@ def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
         unsure = still
     for side, k in unsure:
         ends[side, k] = limits[side]
-    return replace(found, lower=frozen_array(ends[0]), upper=frozen_array(ends[1]))
+    return found.within(ends[0], ends[1])
 
 
 def _converged(fit: Linearisation, found: Uncertainty) -> bool:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, meant
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.quantity import interval, measured
 
 SCALE = 100.0  # the upper end of the paper's scale
 GRAVITY = 9.81  # m/s^2
@@ -68,6 +69,19 @@ class Parameter:
         if self.linear:
             return SCALE * (physical - self.at_zero) / (self.at_hundred - self.at_zero)
         return SCALE * math.log(physical / self.at_zero) / math.log(self.at_hundred / self.at_zero)
+
+    def interval(self, lower: float, upper: float, physical: tuple[float, float], unit: str) -> str:
+        """
+        Return an interval for people; one that reaches one end of the scale is a bound: at least, or at most.
+
+        :param lower: its lower end on the 0..100 scale; `upper` its upper end.
+        :param physical: the lower and the upper physical value in it, in `unit`.
+        """
+        if (lower <= 0) == (upper >= SCALE):
+            return interval(physical[0], physical[1], unit)
+        grows = self.at_hundred > self.at_zero
+        return f'at most {measured(physical[1], unit)}' if (lower <= 0) == grows else \
+            f'at least {measured(physical[0], unit)}'
 
 
 MOST_PARTS = 8  # with bending stiffnesses of their own: the DLO can be halved three times

@@ -49,7 +49,9 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]], space: Parameter
             rows.append(Row(
                 name, BY_NAME[name].quantity, number(one['value']), interval(one['lower'], one['upper'], '1'),
                 measured(one['physical_value'], unit),
-                interval(one['physical_lower'], one['physical_upper'], unit), one['verdict'], one['note']))
+                BY_NAME[name].interval(one['lower'], one['upper'],
+                                       (one['physical_lower'], one['physical_upper']), unit),
+                one['verdict'], one['note']))
     return rows
 
 

@@ -12,7 +12,7 @@ from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.parameters import BY_NAME, knot_names, PER_WEIGHT, SCALE
-from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.report.bending_sentences import friction_sentences, rest_shape_sentences
 
 #: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
@@ -36,15 +36,18 @@ def _known(result: CalibrationResult) -> list[str]:
         verdict = p.verdict or (IDENTIFIABLE if p.identifiable else NOT_IDENTIFIABLE)
         quantity = BY_NAME[name].quantity
         value = measured(p.physical_value, p.physical_unit)
-        ends = interval(p.physical_lower, p.physical_upper, p.physical_unit)
+        ends = BY_NAME[name].interval(p.lower, p.upper, (p.physical_lower, p.physical_upper), p.physical_unit)
+        bound = ends.startswith('at ')  # at least, at most
         if verdict == NOT_IDENTIFIABLE:
             words = f'{name} could not be determined'
-            words += f' ({p.note}): {quantity} {value}' if p.note else \
+            words += f': with these trials, {quantity} is only known to be {ends}' if bound else \
+                f' ({p.note}): {quantity} {value}' if p.note else \
                 f': with these trials, {quantity} may be anything from {ends}'
+        elif bound:
+            words = f'{name} is known on one side only: {quantity} is {ends}, with 90 % probability'
         else:
             well = 'well' if verdict == IDENTIFIABLE else 'only roughly'
             words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {ends}'
-            words += f' ({p.note})' if p.note else ''
         found[verdict].append(f'{words}.')
     texts = [text for group in found.values() for text in group]
     if any(p.physical_unit.endswith(PER_WEIGHT) for p in result.parameters.values()):

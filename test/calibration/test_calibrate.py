@@ -113,7 +113,7 @@ def test_a_value_at_the_end_of_the_scale_is_noted_at_either_end():
     truth = {**TRUTH, 'flexibility': 0.0, 'friction': 100.0}
     result = searched(ParameterSpace(('flexibility', 'friction', 'elasticity'),
                                      {'self_collision': TRUTH['self_collision']}), truth)
-    assert {name for name, one in result.parameters.items() if 'at the end of its scale' in one.note} == {
+    assert {name for name, one in result.parameters.items() if 'where the best value is' in one.note} == {
         'flexibility', 'friction'}
     assert result.parameters['friction'].upper == 100.0
     assert result.parameters['flexibility'].lower == 0.0

@@ -18,6 +18,7 @@ from dlo_calibration.inference.uncertainty import (
     optimum_shift,
     predictive_std,
     spread_of_best,
+    verdict,
 )
 
 TRUTH = np.array([0.4, 0.7])
@@ -49,6 +50,13 @@ def test_a_parameter_with_effect_is_identifiable_and_one_without_is_not(seed):
     assert 'not identifiable' not in found.verdicts[:2]
     assert (found.std[:2] < 0.15).all()
     assert found.std[2] > found.std[:2].max()
+
+
+@pytest.mark.parametrize(('lower', 'upper', 'expected'), [
+    (0.4, 0.6, 'identifiable'), (0.4, 0.61, 'weak'), (0.4, 0.8, 'weak'), (0.4, 0.81, 'not identifiable'),
+    (0.9, 1.0, 'weak'), (0.0, 0.1, 'weak'), (0.5, 1.0, 'not identifiable')])
+def test_the_verdict_is_the_width_of_the_interval_and_a_bound_is_weak_at_best(lower, upper, expected):
+    assert verdict(lower, upper) == expected
 
 
 @pytest.mark.parametrize('seed', range(10))

@@ -61,3 +61,19 @@ def test_fit_is_compared_with_noise(result):
 def test_search_that_did_not_arrive_is_told(result):
     told = sentences(replace(result, examination=replace(result.examination, regular=False)))
     assert any('has not reached a minimum' in text for text in told)
+
+
+def test_an_interval_that_reaches_an_end_of_the_scale_is_a_bound(result):
+    def told(name, **ends):
+        changed = {**result.parameters, name: replace(result.parameters[name], **ends)}
+        return next(text for text in sentences(replace(result, parameters=changed)) if text.startswith(name))
+
+    assert told('elasticity', verdict=WEAK, lower=0.0, upper=15.0, physical_lower=2500.0) == (
+        'elasticity is known on one side only: stretching stiffness EA is at least 2500 N, with 90 % '
+        'probability.')
+    assert told('friction', verdict=WEAK, lower=0.0, upper=15.0, physical_upper=0.02).endswith(
+        'is at most 0.02, with 90 % probability.')
+    assert told('friction', verdict=NOT_IDENTIFIABLE, lower=40.0, upper=100.0, physical_lower=0.08) == (
+        'friction could not be determined: with these trials, Coulomb friction coefficient is only known to '
+        'be at least 0.08.')
+    assert 'anything from' in told('friction', verdict=NOT_IDENTIFIABLE, lower=0.0, upper=100.0)
