@@ -103,15 +103,19 @@ def _other_starts(trials: Sequence[Trial], sigma: float) -> list[tuple[Trial, ..
     Return copies of all trials, whose initial chains have other noise; 16 chains over all trials are enough.
 
     New noise is added to the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
-    Introduction to the Bootstrap, 1993, 6.5); every call makes the same draws.
+    Introduction to the Bootstrap, 1993, 6.5), the same to chains that are equal to the digit; every call
+    makes the same draws.
 
     :param sigma: noise level: standard deviation of one coordinate [m].
     """
     generator = np.random.default_rng(0)
 
-    def drawn(initial: Chain) -> Chain:
-        points = smooth(initial.points, sigma)
-        return replace(initial, points=points + generator.normal(0, sigma, points.shape))
+    def drawn() -> tuple[Trial, ...]:
+        found: dict[bytes, Chain] = {}
+        for trial in trials:
+            points = smooth(trial.initial.points, sigma)
+            found.setdefault(trial.initial.points.tobytes(), replace(
+                trial.initial, points=points + generator.normal(0, sigma, points.shape)))
+        return tuple(replace(trial, initial=found[trial.initial.points.tobytes()]) for trial in trials)
 
-    return [tuple(replace(trial, initial=drawn(trial.initial)) for trial in trials)
-            for _ in range(-(-16 // len(trials)))]
+    return [drawn() for _ in range(-(-16 // len(trials)))]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterable, Sequence
+from typing import Iterable, Sequence, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from dlo_calibration.model.chain import Floats
 STEP = 0.03  # usual; over shorter ones, contacts that come and go dominate the residuals
 WIDEST = 0.25  # largest, for parameters that are hardly known; the linear model holds no further
 TINY = float(np.finfo(float).tiny)  # keeps a divisor above zero
+
+Rows = Union[slice, NDArray[np.intp]]  # of a Jacobian: a trial's, or those of several trials
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Linearisation:
         """Return the model with each residual and its derivatives multiplied by its weight, (m,)."""
         return Linearisation(self.point, weights * self.residuals, weights[:, None] * self.jacobian)
 
-    def rows(self, rows: slice) -> Linearisation:
+    def rows(self, rows: Rows) -> Linearisation:
         """Return the model of some of the residuals."""
         return Linearisation(self.point, self.residuals[rows], self.jacobian[rows])
 

@@ -6,13 +6,14 @@ Uncertainty: the covariance and the intervals of the calibrated parameters, in t
 
 If the search ended in a regular minimum, the covariance follows from the
 Jacobian of the residuals there.  The textbook's formula alone is several times
-too small for real DLOs.  Four things are therefore added:
+too small for real DLOs.  Five things are therefore added:
 
 - the errors of neighbouring points are correlated, so that these count as fewer;
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
 - if the model cannot explain the residuals, the trials disagree with each other; the jackknife and
   the bootstrap over the trials measure how much, and the larger of both counts;
-- the step and the nodes of the simulation move the optimum.
+- the step and the nodes of the simulation move the optimum;
+- trials that look alike share the error of the model, so that repeating one averages only its noise.
 
 If it did not, as in a random search, the spread of the best evaluations is used.
 """
@@ -25,7 +26,7 @@ from typing import Protocol, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import Linearisation
+from dlo_calibration.evaluation.linearisation import Linearisation, Rows, TINY
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats, frozen_array
@@ -37,6 +38,7 @@ UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is t
 IDENTIFIABLE_WIDTH, WEAK_WIDTH = 0.2, 0.4
 DEVIATIONS = 1.645  # half the width of a 90 % interval, in standard deviations of a normal distribution
 MODEL_ERROR = 1.6  # noise alone does not explain residuals that exceed the noise level by this factor
+LIKE = 0.8  # trials are alike from this cosine of their derivatives on; different actions stay below 0.5
 INVOLVED = 0.3  # a parameter belongs to a combination if its share of the unit vector is at least this
 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = 'identifiable', 'weak', 'not identifiable'
@@ -184,22 +186,27 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     scale = residual * float(np.sqrt(correlation_length(clipped, layout)))
     weighted = fit.weighted(loss.roots(fit.residuals) / scale)
     prior = prior_information(len(point))
+    groups = alike(weighted, layout)
+    shared = shared_error(clipped, layout, groups)
+    information = shared_information(weighted, layout, shared)
     with np.errstate(divide='ignore'):
-        excited = 1 / np.sqrt(np.diag(weighted.information)) < UNKNOWN_STD
-    covariance = np.linalg.inv(weighted.information + prior)
+        excited = 1 / np.sqrt(np.diag(information)) < UNKNOWN_STD
+    covariance = np.linalg.inv(information + prior)
     extra = np.zeros(len(point))
     if len(layout.shapes) >= 3 and not noise_alone(residual, noise):  # two say too little of a variance
-        disagreement = np.maximum(
-            np.var(jackknife(weighted, layout.rows, prior), axis=0) * (len(layout.shapes) - 1),
-            np.var(bootstrap(weighted, layout.rows, prior), axis=0))
+        parts: Sequence[Rows] = layout.rows if len(groups) < 3 else [
+            np.concatenate([np.r_[layout.rows[k]] for k in group]) for group in groups]
+        disagreement = np.maximum(np.var(jackknife(weighted, parts, prior), axis=0) * (len(parts) - 1),
+                                  np.var(bootstrap(weighted, parts, prior), axis=0))
         extra = np.maximum(disagreement - np.diag(covariance), 0.0)
     if shift is not None:
         extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
-        pulls = [fit.jacobian[rows].T @ (loss.clipped(one) - clipped)[rows]
-                 for one in starts for rows in layout.rows]
-        moves = covariance @ np.array(pulls).T / scale**2
-        covariance = covariance + np.where(np.outer(excited, excited), moves @ moves.T, 0.0) / len(starts)
+        moved = np.array([loss.clipped(one) - clipped for one in starts])
+        pulls = [moved[:, rows] @ fit.jacobian[rows] / scale**2 for rows in layout.rows]
+        step = np.linalg.inv(weighted.information + prior)
+        moves = step @ together(pulls, shared) @ step / len(starts)
+        covariance = covariance + np.where(np.outer(excited, excited), moves, 0.0)
     covariance = covariance + np.diag(np.where(excited, extra, 0.0))
     # No standard deviation is larger than that of the prior.
     shrink = np.minimum(1.0, UNKNOWN_STD / np.sqrt(np.diag(covariance)))
@@ -212,7 +219,62 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
                        frozen_array(covariance), residual, scale)
 
 
-def jackknife(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Floats:
+def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
+    """Return the indices of T trials in groups that show the same: their derivatives are nearly parallel."""
+    sides = [fit.jacobian[rows].ravel() for rows in layout.rows]
+    sizes = [max(float(np.linalg.norm(side)), TINY) for side in sides]
+    groups: list[list[int]] = []
+    for k, side in enumerate(sides):
+        like = [group for group in groups if layout.shapes[group[0]] == layout.shapes[k]
+                and float(sides[group[0]] @ side) >= LIKE * sizes[group[0]] * sizes[k]]
+        if like:
+            like[0].append(k)
+        else:
+            groups.append([k])
+    return groups
+
+
+def shared_error(residuals: Floats, layout: ResidualLayout, groups: Sequence[Sequence[int]]) -> Floats:
+    """
+    Return (T, T): the correlation of the errors of any two of T trials; 0 between those of different groups.
+
+    It is the mean correlation of their residuals (m,) [m], as far as it is positive: 1 for a trial that is
+    repeated to the digit, near 0 where the model is right and only the noise is new each time.
+    """
+    shared = np.eye(len(layout.shapes))
+    for group in groups:
+        each = np.stack([residuals[layout.rows[k]] for k in group])
+        power, count = float(np.square(each).sum()), len(group)
+        if count > 1 and power > 0:
+            both = float(np.square(each.sum(axis=0)).sum()) - power  # of all pairs, either way
+            shared[np.ix_(group, group)] = np.clip(both / power / (count - 1), 0.0, 1.0)
+    np.fill_diagonal(shared, 1.0)
+    return shared
+
+
+def shared_information(fit: Linearisation, layout: ResidualLayout, shared: Floats) -> Floats:
+    """
+    Return the (d, d) information of T trials whose errors have the correlations `shared`, (T, T).
+
+    It is H V^-1 H (Godambe's information: Varin, Reid and Firth, An Overview of Composite Likelihood Methods,
+    2011, 2.1) with the information H of independent trials and the variance V of the gradient: that of
+    H for independent ones, and that of one trial for its exact repeats.
+    """
+    alone = fit.information
+    if np.count_nonzero(shared) == len(shared):
+        return alone
+    gradients = together([fit.jacobian[rows] for rows in layout.rows], shared)
+    return np.asarray(alone @ np.linalg.pinv(gradients, hermitian=True) @ alone)
+
+
+def together(blocks: Sequence[Floats], shared: Floats) -> Floats:
+    """Return (d, d): the products B_t^T B_s of T blocks (r, d), summed with the weights `shared`, (T, T)."""
+    dimension = blocks[0].shape[1]
+    return sum((shared[one, other] * blocks[one].T @ blocks[other]
+                for one, other in np.argwhere(shared).tolist()), np.zeros((dimension, dimension)))
+
+
+def jackknife(fit: Linearisation, groups: Sequence[Rows], prior: Floats) -> Floats:
     """
     Return (T, d): how far the optimum moves when each group of residuals in turn is left out.
 
@@ -230,7 +292,7 @@ def jackknife(fit: Linearisation, groups: Sequence[slice], prior: Floats) -> Flo
     return np.array(moved)
 
 
-def bootstrap(fit: Linearisation, groups: Sequence[slice], prior: Floats, draws: int = 200) -> Floats:
+def bootstrap(fit: Linearisation, groups: Sequence[Rows], prior: Floats, draws: int = 200) -> Floats:
     """
     Return (draws, d): how far the optimum moves when T trials are drawn from the T trials with replacement.
 

@@ -156,6 +156,50 @@ def test_where_the_model_is_wrong_the_disagreement_of_the_trials_counts():
     assert found.std[0] > 0.03
 
 
+REPEATS = ResidualLayout(((1, 40),) * 4)
+
+
+def repeated(residuals, trials=4):
+    """Return the model of one trial that is repeated; its residuals are (trials, 120) [m]."""
+    jacobian = linear_model()[LAYOUT.rows[0]]
+    return Linearisation(POINT, residuals.ravel(), np.tile(jacobian, (trials, 1)))
+
+
+def test_a_trial_that_is_repeated_to_the_digit_counts_once():
+    once = np.random.default_rng(11).normal(0, 1e-3, (1, 120))
+    moved = np.random.default_rng(12).normal(0, 1e-3, (3, 1, 120))
+    single, fourfold = (
+        at_minimum(repeated(np.tile(once, (count, 1)), count), ResidualLayout(((1, 40),) * count), noise=1e-3,
+                   starts=[np.tile(once + one, (count, 1)).ravel() for one in moved]) for count in (1, 4))
+    # The residuals of one trial count as fewer by the three parameters.
+    assert fourfold.std == pytest.approx(single.std, rel=0.03)
+    assert fourfold.std[0] > 0.001
+
+
+def test_a_repeat_averages_its_noise_and_not_the_error_of_the_model():
+    generator = np.random.default_rng(13)
+    noise, error = generator.normal(0, 1e-3, (4, 120)), generator.normal(0, 3e-3, (1, 120))
+    one, four = (at_minimum(repeated(noise[:count], count), ResidualLayout(((1, 40),) * count), noise=1e-3)
+                 for count in (1, 4))
+    assert four.std / one.std == pytest.approx(np.full(3, 0.5), rel=0.15)
+    wrong, again = (at_minimum(repeated(noise[:count] + error, count), ResidualLayout(((1, 40),) * count),
+                               noise=1e-3) for count in (1, 4))
+    assert (again.std / wrong.std > 0.85).all()
+    assert again.verdicts == wrong.verdicts
+
+
+def test_nine_of_ten_intervals_contain_the_truth_where_repeats_share_the_error_of_the_model():
+    jacobian, inside = repeated(np.zeros((4, 120))).jacobian, []
+    for seed in range(200):
+        generator = np.random.default_rng(seed)
+        errors = (generator.normal(0, 2e-3, 120) + generator.normal(0, 1e-3, (4, 120))).ravel()
+        moved, residuals = fitted(jacobian, errors)
+        found = at_minimum(Linearisation(POINT + moved, residuals, jacobian), REPEATS, noise=1e-3)
+        inside.append((found.lower <= POINT) & (POINT <= found.upper))
+    assert (np.mean(inside, axis=0) > 0.85).all()
+    assert (np.mean(inside, axis=0) < 0.96).all()
+
+
 def test_leaving_a_trial_out_moves_the_optimum_as_a_new_fit_would():
     jacobian = linear_model()
     errors = np.random.default_rng(2).normal(0, 1e-3, ROWS)
