@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import sys
 import threading
+import time
 from typing import Any, Callable, Iterator, TYPE_CHECKING
 import webbrowser
 
@@ -36,6 +37,8 @@ from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
     from dlo_calibration.capture.connections import Graph
+    from dlo_calibration.evaluation.compiling import Compiling
+    from dlo_calibration.simulation.protocol import Simulator
 
 TEXT = 'open the page in which photographs become trials, and calibrate there'
 FOLDER = Path('dlo-capture')
@@ -75,26 +78,49 @@ def serve_page(chosen: argparse.Namespace, make_simulator: SimulatorFactory,
 
     :param ready: called with its address.
     """
-    from dlo_calibration.capture.connections import Connections
-    from dlo_calibration.capture.project import Project
-    from dlo_calibration.capture.server import serve
-
     Options.of({**Options().flat(), **given_options(chosen)})  # a bad value is told at once
     if not 0 <= chosen.port <= 65535:
         raise InputError('option port', str(chosen.port), '0 to 65535', 'choose one in that range')
     with ExitStack() as stack:
         with _no_output_to_choose('name another folder'):
             make_folder(chosen.folder)
+        simulation = _compiled(stack, should_stop)
+        if should_stop():
+            return
+        from dlo_calibration.capture.connections import Connections
+        from dlo_calibration.capture.project import Project
+        from dlo_calibration.capture.server import serve
+
+        def make_compiled(options: Options) -> Simulator:
+            simulation.wait(should_stop)
+            return make_simulator(options)
+
         project = Project(chosen.folder)
         stack.callback(project.close)
         for problem in project.problems:
             tell(problem)
         connections = Connections(
-            begin=partial(_Calibration.begin, chosen, make_simulator),
-            sentences=_sentences, graph=_graph(), options=_recorded(chosen), make_simulator=make_simulator)
+            begin=partial(_Calibration.begin, chosen, make_compiled),
+            sentences=_sentences, graph=_graph(), options=_recorded(chosen), make_simulator=make_compiled)
         serve(project, connections, host=chosen.host, port=chosen.port, ready=ready,
               should_stop=should_stop)
     tell(f'everything is kept in {chosen.folder}')
+
+
+def _compiled(stack: ExitStack, should_stop: Callable[[], bool]) -> Compiling:
+    """Wait until the tracer is compiled; return the compilation of the simulation, which goes on."""
+    from dlo_calibration.evaluation.compiling import Compiling
+    from dlo_calibration.simulation.kernel_cache import TRACER
+
+    tracer, simulation = Compiling(TRACER), Compiling()
+    for one in (tracer, simulation):
+        stack.callback(one.close)
+        one.begin()
+    while not (tracer.done or should_stop()):
+        for text in tracer.news():
+            tell(text)
+        time.sleep(0.02)
+    return simulation
 
 
 @dataclass

@@ -12,7 +12,18 @@ from typing import Any, NoReturn, Sequence
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.cli import capture, experiment, fit, info, plan, plot, simulate, trace, validate
+from dlo_calibration.cli import (
+    capture,
+    experiment,
+    fit,
+    info,
+    plan,
+    plot,
+    simulate,
+    trace,
+    validate,
+    warm_up,
+)
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
@@ -20,7 +31,8 @@ from dlo_calibration.signals import exit_code
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 #: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
 VERBS = {'capture': capture, 'trace': trace, 'fit': fit, 'validate': validate, 'simulate': simulate,
-         'plan': plan, 'info': info, 'plot': plot, 'experiment': experiment}
+         'plan': plan, 'info': info, 'plot': plot, 'experiment': experiment,
+         'warm-up': warm_up}
 
 
 def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_chosen_simulator) -> int:

@@ -30,10 +30,13 @@ class PlannerProcesses:
 
     :param make_simulator: makes the engine; it is sent to the processes.
     :param on_death: called with a sentence for each process that dies, from any thread.
+    :param wait: waits until the kernels are compiled, or its argument tells to stop; see `Compiling`.
     """
 
-    def __init__(self, make_simulator: SimulatorFactory, on_death: Callable[[str], None]) -> None:
+    def __init__(self, make_simulator: SimulatorFactory, on_death: Callable[[str], None],
+                 wait: Callable[[Callable[[], bool]], None] = lambda should_stop: None) -> None:
         self._make_simulator = make_simulator
+        self._wait = wait
         self._on_death = on_death
         self._changing = threading.Lock()  # held while the engine is being loaded, too
         self._starting = threading.Lock()
@@ -57,13 +60,14 @@ class PlannerProcesses:
             waits no longer.
         :raises CancelledError: after `close`.
         """
+        self._wait(should_stop)
         while not self._changing.acquire(timeout=PERIOD):
             _check(should_stop)
         try:
             executor = self._started(workers or cores(), simulation.answer_limit)
             engine = f'{simulation.engine} {simulation.scene}'
             if self._engine != engine:
-                # One alone compiles the kernels, if they are not in Numba's cache; the others load them.
+                # One alone compiles what an engine may have besides the kernels; the others load it.
                 first = executor.submit(_load, self._make_simulator, simulation)
                 while not wait([first], PERIOD).done:
                     _check(should_stop)

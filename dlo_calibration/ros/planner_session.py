@@ -19,6 +19,7 @@ from dlo_calibration.calibration.background import Background, Failure, Notice
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
+from dlo_calibration.evaluation.compiling import Compiling
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
@@ -59,7 +60,7 @@ OUTPUT_TYPES: Mapping[str, str] = {
 }
 LARGEST_DESCRIPTION = 10**6  # bytes; a DLO of 10,000 points needs less, and it is read within 0.2 s
 PROGRESS_PERIOD = 0.1  # s between two messages; nobody reads faster
-FIRST = 'the first actions are simulated; the engine may have to be compiled before, once per machine'
+FIRST = 'the first actions are simulated'
 PATIENCE = 0.5  # s that closing waits for the planning thread
 
 Event = Union[PlanProgress, Notice, Plan, Failure]
@@ -107,8 +108,9 @@ class PlannerSession:
         self._find = plan
         self._make_simulator = functools.partial(MadeWhereUsed, make_simulator)
         self._background: Background[Event] = Background('plan')
+        self._compiling = Compiling()
         self._processes: Processes = processes or PlannerProcesses(
-            make_simulator, lambda text: self._background.events.put(Notice(text)))
+            make_simulator, lambda text: self._background.events.put(Notice(text)), self._compiling.wait)
         self._chains = {kind: Newest(lambda octets, kind=kind: self._chain(kind, octets))  # type: ignore[misc]
                         for kind in (CHAIN, GOAL)}
         self._descriptions = Newest(self._described)
@@ -122,6 +124,7 @@ class PlannerSession:
         self._plan: Plan | None = None
         self._plans, self._under_way = 0, False
         self._frame_id = ''  # of the chains that are planned with
+        self._compiling.begin()
         self._report()
 
     @property
@@ -174,6 +177,8 @@ class PlannerSession:
             self._read_due(kind)
         for event in self._background.waiting_events():
             self._take(event)
+        for text in self._compiling.news():
+            self._graph.info(text)
         if self._progress is not None and self._clock() - self._sent >= PROGRESS_PERIOD:
             self._send_progress()
         self._tell_refusals()
@@ -189,6 +194,7 @@ class PlannerSession:
     def close(self) -> None:
         """End a plan under way, without publishing it, and the processes."""
         self._background.stop()
+        self._compiling.close()
         self._processes.close()
         self._background.join(PATIENCE)
         for text in self._refusals.rest():
@@ -316,6 +322,8 @@ class PlannerSession:
         missing, detail = self._missing(), self._detail
         if self._state == WAITING:
             detail = f'for {", ".join(f"~/{name}" for name in missing or ["plan"])}'
+        if self._compiling.under_way and self._state in (WAITING, PLANNING):
+            detail = f'{detail}; {self._compiling.under_way}'
         content: dict[str, Any] = {
             'state': self._state, 'detail': detail, 'missing': missing, 'last_refusal': self._last_refusal,
             'description': self._origin, 'plans': self._plans}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 import time
-from typing import Any, Callable, Mapping
+from typing import Callable, Mapping
 
 from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
@@ -22,6 +22,7 @@ from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
+from dlo_calibration.evaluation.compiling import Compiling
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import description_document
@@ -32,14 +33,13 @@ from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.graph import decoded, Graph, why
-from dlo_calibration.ros.markers import markers
+from dlo_calibration.ros.outlet import Outlet
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.ros.situation import Calibration, Pace, Situation
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
-OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
 
 
 class CalibrationSession:
@@ -62,12 +62,16 @@ class CalibrationSession:
         self._worker = Worker(make_simulator)
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
+        self._outlet = Outlet(graph, types, self._recorder, clock)
+        # In a thread of this process, loading compiled kernels delays no answer by more than 0.1 s.
+        self._compiling = Compiling(then=lambda: make_simulator(self._collected_with).close())
         self._situation = Situation()
         self._calibration: Calibration | None = None
         self._order = StampOrder()
         self._began = self._clock()
         self.behind = False  # whether messages wait; appraisals and markers would delay them
         self._begin_recording()
+        self._compiling.begin()
         self._report()
 
     @property
@@ -132,6 +136,8 @@ class CalibrationSession:
         """Do what is due now; the node calls this many times a second."""
         self._take_events()
         self._recorder.tell()
+        for text in self._compiling.news():
+            self._graph.info(text)
         self._tell_refusals(self._situation.counted.due(self._clock()))
         self._tell_dropped()
         self._start_by_itself()
@@ -154,6 +160,7 @@ class CalibrationSession:
         """End the calibration, with its best evaluation so far as the result, then the recording."""
         self._worker.stop()
         self._appraiser.stop()
+        self._compiling.close()
         try:
             self._tell_dropped(at_once=True)
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
@@ -222,7 +229,9 @@ class CalibrationSession:
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
-        self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
+        compiled = self._compiling.done
+        if compiled:
+            self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         log = self._recorder.start(trials, options)
         situation = self._situation
         choice = choose(trials, options)
@@ -231,9 +240,11 @@ class CalibrationSession:
         situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
         situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
-        self._worker.start(trials, options, log)
-        return ' '.join([f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations'
-                         f'{"." * bool(choice.words)}', choice.words]).rstrip()
+        self._worker.start(trials, options, log, self._compiling.wait)
+        later = '' if compiled else 'It begins when the simulation is compiled, in half a minute or less.'
+        words = ' '.join(filter(None, [choice.words, later]))
+        return f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations' \
+               f'{f". {words}" if words else ""}'
 
     def _start_by_itself(self) -> None:
         situation, wanted = self._situation, self._graph.options().start_after_trials
@@ -284,14 +295,13 @@ class CalibrationSession:
                 self._finish(event)
             elif self._calibration is not None:
                 self._calibration.progress.take(event)
-        # At most ten progress messages a second: nobody reads faster, and each is recorded.
-        if self._calibration is not None and self._clock() - self._calibration.sent >= 0.1:
-            self._send_progress(self._calibration)
+        if self._calibration is not None:
+            self._outlet.progress(self._calibration)
 
     def _finish(self, event: CalibrationResult | Failure) -> None:
         calibration, self._calibration = self._calibration, None
         assert calibration is not None
-        self._send_progress(calibration)
+        self._outlet.progress(calibration, at_once=True)
         self._worker.join()
         if isinstance(event, Failure):
             self._recorder.finish(interrupted=True)
@@ -309,8 +319,8 @@ class CalibrationSession:
                          f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
         for warning in event.warnings:
             self._graph.warn(warning)
-        self._send('result', diagnostics.result(self._types, event, self._graph.stamp()))
-        self._send('dlo_description', self._types.build(
+        self._outlet.send('result', diagnostics.result(self._types, event, self._graph.stamp()))
+        self._outlet.send('dlo_description', self._types.build(
             OUTPUT_TYPES['dlo_description'], data=description_document(event, options.flat()).decode()))
         self._recorder.result(event, options)
         self._recorder.finish(interrupted=self._worker.stopped)
@@ -325,7 +335,8 @@ class CalibrationSession:
         quiet = now - situation.heard > QUIET
         # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
         if situation.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
-                and not self._appraiser.alive and (quiet or now - situation.appraisal.last > 2.0):
+                and self._compiling.done and not self._appraiser.alive \
+                and (quiet or now - situation.appraisal.last > 2.0):
             situation.appraisal = Pace(wanted=not quiet, last=now)
             self._appraiser.start(self._collector.trials, self._graph.options(), situation.result, quiet)
 
@@ -342,40 +353,13 @@ class CalibrationSession:
             situation.told_dropped = Counter(situation.dropped)
             self._recorder.dropped(situation.dropped)
 
-    def _send_progress(self, calibration: Calibration) -> None:
-        """Send the newest evaluation, unless it has been sent."""
-        progress = calibration.progress
-        if progress.newest is None or progress.best is None:
-            return
-        self._send('progress', diagnostics.progress(
-            self._types, stamp=self._graph.stamp(), evaluation=progress.newest, best=progress.best,
-            evaluations=progress.evaluations, simulations_per_second=progress.simulations_per_second,
-            seconds_left=progress.seconds_left, spread=progress.spread))
-        progress.newest, calibration.sent = None, self._clock()
-
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        situation = self._situation
-        content: dict[str, Any] = {
-            'state': situation.state, 'trials': self._collector.count, 'last_refusal': situation.last_refusal,
-            'incomplete': self._collector.incomplete, 'detail': situation.detail,
-            'information': situation.information, 'dropped': situation.told_dropped.total()}
-        if content != situation.status:
-            situation.status = content
-            self._send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))
+        self._outlet.status(self._situation, self._collector, self._compiling.under_way)
 
     def _show(self) -> None:
         """Send the markers of all trials."""
-        self._situation.markers = Pace(last=self._clock())
-        self._send('markers', markers(self._types, self._collector.trials, stamp=self._graph.stamp(),
-                                      frame_id=self._collector.frame_id, result=self._situation.result))
-
-    def _send(self, name: str, message: Any) -> None:
-        octets = self._graph.encode(name, message)
-        # Recorded first, so that every message that a subscriber received is on the disk.
-        record = self._recorder.of_calibration if name in OF_CALIBRATION else self._recorder.message
-        record(self._graph.topic(name), OUTPUT_TYPES[name], octets)
-        self._graph.publish(name, octets)
+        self._outlet.markers(self._situation, self._collector)
 
     def _begin_recording(self) -> None:
         self._recorder.begin(self._graph.options())

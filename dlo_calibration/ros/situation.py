@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from typing import Any
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.progress import Progress
@@ -40,7 +39,6 @@ class Situation:
     :param counted: the same, by their reason.
     :param heard: time of the last action or goal chain [s].
     :param started: whether a calibration was started, so that `start_after_trials` starts none.
-    :param status: content of the last ``~/status``.
     :param result: of the last calibration.
     :param information: about the newest trial that was appraised.
     :param dropped: how many messages of each kind were dropped; `told_dropped`: as told `telling.last`.
@@ -53,7 +51,6 @@ class Situation:
     counted: Refusals = field(default_factory=Refusals)
     heard: float = float('-inf')
     started: bool = False
-    status: dict[str, Any] = field(default_factory=dict)
     result: CalibrationResult | None = None
     information: TrialInformation | None = None
     dropped: Counter[str] = field(default_factory=Counter)

@@ -12,6 +12,7 @@ import time
 from mortal import Mortal
 import pytest
 from result_message import result_values
+from slow_compiler import compile_slowly
 from toy_graph import PATIENCE, ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
 from toy_simulator import ToySimulator
@@ -19,7 +20,7 @@ from wrong_input import with_point
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.identity import calibration_digest
-from dlo_calibration.evaluation import EvaluationLog
+from dlo_calibration.evaluation import compiling, EvaluationLog
 from dlo_calibration.files import recording
 from dlo_calibration.files.bag import encode
 from dlo_calibration.files.intake import OUTPUT_TYPES
@@ -181,6 +182,36 @@ def test_what_is_refused_for_one_reason_is_counted(start):
     graph.ahead = 2.0
     graph.session.tick()
     assert graph.logged['warn'][1:] == [graph.status['last_refusal']]
+
+
+def test_a_start_while_the_simulation_is_compiled_is_accepted_and_says_that_it_waits(start, monkeypatch):
+    monkeypatch.setattr(compiling, 'is_compiled', lambda module: False)
+    monkeypatch.setattr(compiling, 'compile_kernels', compile_slowly)
+    graph = start()
+    graph.until(lambda: 'compiling the simulation' in graph.status['detail'])
+    assert any('compiling the simulation' in text for text in graph.logged['info'])
+    graph.send(session_messages(TYPES, 1))
+    done, answer = graph.session.request('start')
+    assert done and 'begins when the simulation is compiled' in answer
+    assert (graph.status['state'], 'compiling' in graph.status['detail']) == ('calibrating', True)
+    assert graph.session.request('stop')[0]
+    graph.until(lambda: graph.status['state'] == 'failed')
+    assert 'while the engine was being loaded or compiled' in graph.status['detail']
+
+
+def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
+    graph = start(status_period=1.0)
+    before = len(graph.heard['status'])
+    bad = with_point(4, float('nan'))(TYPES)
+    for k in range(50):
+        bad.header.stamp.sec = 200 + k
+        graph.send([(GOAL, bad)])
+    assert len(graph.heard['status']) - before <= 1
+    graph.ahead += 1.0
+    graph.session.tick()
+    assert graph.status['last_refusal'].endswith(' (50 times)')
+    graph.send(session_messages(TYPES, 1))  # a trial is told at once
+    assert graph.status['trials'] == '1'
 
 
 def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):

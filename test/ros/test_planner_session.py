@@ -131,7 +131,7 @@ def test_one_plan_at_a_time_and_stop_publishes_the_best_so_far(started):
     graph.send_chains()
     assert graph.session.request('plan')[0]
     assert graph.status['state'] == 'planning'
-    assert 'may have to be compiled' in graph.status['detail']
+    assert 'the first actions' in graph.status['detail']
     graph.until(lambda: graph.status['detail'] == '')
     done, answer = graph.session.request('plan')
     assert not done and 'a plan under way' in answer

@@ -84,10 +84,11 @@ class ToyNode:
 class ToyGraph(ToyNode):
     """The graph of a calibration session."""
 
-    def __init__(self, folder, make, **options):
+    def __init__(self, folder, make, status_period=0.0, **options):
         super().__init__('calibrator', INPUT_TYPES, OUTPUT_TYPES)
         self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
         self.session = CalibrationSession(self, TYPES, make, self.clock)
+        self.session._outlet.status_period = status_period
 
     def options(self):
         return Options.of({**Options().flat(), **self.set})
