@@ -22,9 +22,9 @@ from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Floats, frozen_array, put_back
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
-from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.score import observed, PointErrors
 from dlo_calibration.model.trial import Trial
 
 
@@ -198,8 +198,14 @@ def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[F
     """Return the simulated chains of each trial, (g, n, 3) [m], from the residuals of an evaluation."""
     assert evaluation.residuals is not None
     apart = ResidualLayout.of(trials).chains(evaluation.residuals)
-    return tuple(frozen_array(np.stack([goal.chain.points for goal in trial.goals]) + away)
-                 for trial, away in zip(trials, apart, strict=True))
+    found = []
+    for trial, away in zip(trials, apart, strict=True):
+        chains, places = observed(trial) + away, trial.initial.arc_lengths()
+        for k, goal in enumerate(trial.goals):
+            if not goal.chain.seen.all():  # nothing was compared there
+                chains[k] = put_back(chains[k], goal.chain.seen, places)
+        found.append(frozen_array(chains))
+    return tuple(found)
 
 
 def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:

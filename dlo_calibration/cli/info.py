@@ -69,5 +69,6 @@ def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
         'timed_goals': sum(not goal.stable for goal in trial.goals),
         'duration_s': max(trial.goals[-1].time, *(hand.end for hand in trial.hands)),
         'moving_start': trial.velocity is not None,
+        'unseen_points': int(sum((~chain.seen).sum() for chain in chains)),
         'annotated_hands': any(chain.hands is not None for chain in chains),
         'annotated_features': int(sum(chain.features.sum() for chain in chains))}

@@ -11,12 +11,13 @@ examination compare a few of them, `compared_goals`, which saves most of their l
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.score import seen_points
 from dlo_calibration.model.trial import Trial
 
 #: Timed goals of one trial whose residuals search and examination compare; see doc/physics.md, A trial.
@@ -46,27 +47,39 @@ class ResidualLayout:
     """
     The order of a residual vector (m,): by trial, goal, point and coordinate.
 
-    The rows of its Jacobian have the same order.
+    Points that were not seen have no residuals. The rows of its Jacobian have the same order.
 
     :param shapes: numbers of goals and points of each of T trials.
+    :param unseen: for each trial, the unseen points: goal times the number of points, plus point; empty: none
+        in any trial.
     """
 
     shapes: tuple[tuple[int, int], ...]
+    unseen: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> ResidualLayout:
         """Return the layout of the residuals at every goal of trials."""
-        return cls(tuple((len(trial.goals), len(trial.initial)) for trial in trials))
+        return cls._at(trials, [list(range(len(trial.goals))) for trial in trials])
 
     @classmethod
     def compared(cls, trials: Sequence[Trial]) -> ResidualLayout:
         """Return the layout of the residuals at the goals that search and examination compare."""
-        return cls(tuple((len(compared_goals(trial)), len(trial.initial)) for trial in trials))
+        return cls._at(trials, [compared_goals(trial) for trial in trials])
+
+    @classmethod
+    def _at(cls, trials: Sequence[Trial], chosen: Sequence[Sequence[int]]) -> ResidualLayout:
+        unseen = tuple(tuple(np.flatnonzero(~seen_points(trial)[goals]).tolist())
+                       for trial, goals in zip(trials, chosen, strict=True))
+        shapes = ((len(goals), len(trial.initial)) for trial, goals in zip(trials, chosen, strict=True))
+        return cls(tuple(shapes), unseen if any(unseen) else ())
 
     @property
     def rows(self) -> list[slice]:
         """The rows of each trial, T slices."""
-        ends = np.cumsum([0, *(3 * goals * points for goals, points in self.shapes)]).tolist()
+        missing = [len(one) for one in self.unseen] or [0] * len(self.shapes)
+        ends = np.cumsum([0, *(3 * (goals * points - fewer) for (goals, points), fewer
+                               in zip(self.shapes, missing, strict=True))]).tolist()
         return [slice(begin, end) for begin, end in zip(ends[:-1], ends[1:], strict=True)]
 
     def folds(self, most: int) -> list[slice]:
@@ -76,14 +89,23 @@ class ResidualLayout:
         return [slice(rows[group[0]].start, rows[group[-1]].stop) for group in groups]
 
     def chains(self, residuals: Floats) -> list[Floats]:
-        """Split (m,) residuals [m] into one array (goals, points, 3) [m] per trial."""
-        return [residuals[rows].reshape(*shape, 3)
-                for rows, shape in zip(self.rows, self.shapes, strict=True)]
+        """Split (m,) residuals [m] into one array (goals, points, 3) [m] per trial; NaN at unseen points."""
+        return [self._spread(k, residuals[rows].reshape(-1, 3)).reshape(*shape, 3)
+                for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
 
     def by_point(self, values: Floats) -> list[Floats]:
-        """Split (m / 3,) values, one per point, into one array (goals, points) per trial."""
-        return [values[rows.start // 3:rows.stop // 3].reshape(shape)
-                for rows, shape in zip(self.rows, self.shapes, strict=True)]
+        """Split (m / 3,) values, one per point, into one array (goals, points) per trial; else NaN."""
+        return [self._spread(k, values[rows.start // 3:rows.stop // 3]).reshape(shape)
+                for k, (rows, shape) in enumerate(zip(self.rows, self.shapes, strict=True))]
+
+    def _spread(self, k: int, seen: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of all points of trial k from those of its seen points."""
+        if not self.unseen or not self.unseen[k]:
+            return seen
+        goals, points = self.shapes[k]
+        whole = np.full((goals * points, *seen.shape[1:]), np.nan)
+        whole[np.delete(np.arange(len(whole)), self.unseen[k])] = seen
+        return whole
 
 
 def compared_rows(trials: Sequence[Trial]) -> NDArray[np.intp] | None:
@@ -93,20 +115,24 @@ def compared_rows(trials: Sequence[Trial]) -> NDArray[np.intp] | None:
         return None
     layout = ResidualLayout.of(trials)
     places = layout.chains(np.arange(layout.rows[-1].stop))
-    return np.concatenate([block[goals].ravel() for block, goals in zip(places, chosen, strict=True)])
+    rows = np.concatenate([block[goals].ravel() for block, goals in zip(places, chosen, strict=True)])
+    return np.asarray(rows[np.isfinite(rows)], np.intp)
 
 
 def at_every_goal(values: Floats, trials: Sequence[Trial]) -> Floats:
     """
     Return values for the points of every goal, from (p,) values for those of the compared ones.
 
-    Between two compared goals they are interpolated linearly in time.
+    Between two compared goals that show a point they are interpolated linearly in time.
     """
     filled = []
     for trial, block in zip(trials, ResidualLayout.compared(trials).by_point(values), strict=True):
         goals, times = compared_goals(trial), [goal.time for goal in trial.goals]
-        known = [times[k] for k in goals]
-        whole = np.stack([np.interp(times, known, column) for column in block.T], axis=1)
-        whole[goals] = block
-        filled.append(whole.ravel())
+        known, usual = np.array(times)[goals], np.nanmean(block)
+        columns = [np.isfinite(column) for column in block.T]
+        whole = np.stack([np.interp(times, known[there], column[there]) if there.any() else
+                          np.full(len(times), usual)
+                          for there, column in zip(columns, block.T, strict=True)], axis=1)
+        whole[goals] = np.where(np.isfinite(block), block, whole[goals])
+        filled.append(whole[seen_points(trial)])
     return np.concatenate(filled)

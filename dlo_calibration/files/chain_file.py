@@ -28,8 +28,8 @@ LONGEST_ROW = 200  # characters
 
 
 def chain_csv(chain: Chain) -> bytes:
-    """Return a chain as CSV; the annotations are left out."""
-    return ''.join(f'{",".join(map(exact, point))}\n' for point in chain.points.tolist()).encode()
+    """Return a chain as CSV, with nan for points that were not seen; the annotations are left out."""
+    return ''.join(f'{",".join(map(exact, point))}\n' for point in chain.observed.tolist()).encode()
 
 
 def chain_xml(chain: Chain) -> bytes:

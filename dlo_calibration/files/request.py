@@ -39,7 +39,7 @@ from dlo_calibration.files.xml import (
     write_octets,
 )
 from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, Floats, frozen_array, length_change
 from dlo_calibration.model.manipulation import in_steps, Manipulation, PATHS, Timed
 from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
 from dlo_calibration.model.trial import Goal, Trial
@@ -266,8 +266,7 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
                 'observe the DLO after the action, or predict it with dlo-calibration simulate')))
             continue
         trial = one.trial(options.release)
-        length = trial.initial.length
-        change = max(abs(goal.chain.length - length) / length * 100 for goal in trial.goals)
+        change = max(length_change(trial.initial, goal.chain) for goal in trial.goals)
         if change > options.length_tolerance:
             refusals.append(str(InputError(
                 f'trial {trial.name!r}', f'a goal chain whose length differs by {change:.0f} %',

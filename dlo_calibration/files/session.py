@@ -223,7 +223,7 @@ def _collected(messages: Iterable[Message],
 
 def _same(one: Message, other: Message) -> bool:
     """Tell whether two messages of one kind and stamp have the same content."""
-    a, b = (message.positions if isinstance(message, ActionMessage) else message.chain.points
+    a, b = (message.positions if isinstance(message, ActionMessage) else message.chain.observed
             for message in (one, other))
     return bool(np.array_equal(a, b, equal_nan=True))
 

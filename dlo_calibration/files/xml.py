@@ -153,8 +153,9 @@ def add_chain(parent: Any, tag: str, chain: Chain, **attributes: Any) -> Any:
     """Add a chain with its annotations."""
     element = add(parent, tag, **attributes)
     hands = [None] * len(chain) if chain.hands is None else chain.hands.tolist()
-    for (x, y, z), hand, feature in zip(chain.points.tolist(), hands, chain.features.tolist(), strict=True):
-        add(element, 'point', x=x, y=y, z=z, hand=hand, feature=feature or None)
+    for (x, y, z), hand, feature, seen in zip(chain.points.tolist(), hands, chain.features.tolist(),
+                                              chain.seen.tolist(), strict=True):
+        add(element, 'point', x=x, y=y, z=z, hand=hand, feature=feature or None, seen=None if seen else False)
     return element
 
 
@@ -168,7 +169,8 @@ def read_chain(where: str, element: Any) -> Chain:
     try:
         return Chain(read_vectors(where, element),
                      None if None in annotated else np.array([int(hand) for hand in annotated], np.uint8),
-                     np.array([point.get('feature') == 'true' for point in element]))
+                     np.array([point.get('feature') == 'true' for point in element]),
+                     np.array([point.get('seen') != 'false' for point in element]))
     except InputError as error:
         if error.thing.startswith(where):
             raise

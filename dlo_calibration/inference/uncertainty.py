@@ -319,14 +319,19 @@ def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:
     Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial.
     Each sum ends before the first rho_k that white noise could have.
     """
-    blocks = layout.chains(residuals)
-    power = float(np.mean([np.square(block).mean() for block in blocks]))
+    spread = layout.chains(residuals)
+    power = float(np.mean([np.nanmean(np.square(block)) for block in spread]))
+    blocks = [np.nan_to_num(block) for block in spread]  # points that were not seen add nothing
+    known = [np.isfinite(block) for block in spread]
     lengths = []
     for axis in (1, 0):
         length, turned = 1.0, [np.moveaxis(block, axis, 0) for block in blocks]
+        there = [np.moveaxis(block, axis, 0) for block in known]
         for lag in range(1, max(len(block) for block in turned) // 2 + 1):
             pairs = [(block[lag:], block[:-lag]) for block in turned if lag <= len(block) // 2]
-            count = sum(one.size for one, _ in pairs)
+            count = sum(int(np.sum(one[lag:] & one[:-lag])) for one in there if lag <= len(one) // 2)
+            if not count:
+                break
             product = sum(float(np.vdot(one, other)) for one, other in pairs) / count
             correlation = product / power if power > 0 else 0.0
             if correlation < 2 / np.sqrt(count):

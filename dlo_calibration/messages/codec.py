@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import far_from_unit, MAXIMUM_HANDS, quaternion_lengths
-from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, check_ends, check_size, Floats, frozen_array
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
 INPUT_TYPES: Mapping[str, str] = {
@@ -204,7 +204,10 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
         raise InputError(thing, f'hand {hands.max()}', f'0 for none, or 1 to {MAXIMUM_HANDS}',
                          'number the hands as in joint_names of the action')
     points = np.stack([table[name].astype(float) for name in COORDINATES], axis=1)
-    return ChainMessage(kind, stamp, cloud.header.frame_id, _chain(thing, points, hands, features))
+    chain = _chain(thing, points, hands, features)
+    if kind != GOAL:  # an initial chain, or the one from which to plan
+        check_ends(thing, chain)
+    return ChainMessage(kind, stamp, cloud.header.frame_id, chain)
 
 
 def _chain(thing: str, points: Floats, hands: Any = None, features: Any = None) -> Chain:
@@ -315,12 +318,14 @@ def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str, *,
     """
     Build a PointCloud2 with the fields x y z, and `hand` and `feature` where they are annotated.
 
+    A point that was not seen is NaN.
+
     :param stamp: [ns].
     :param single: True: coordinates as float32; False: as float64, which is exact.
     """
     number = FLOAT32 if single else FLOAT64
     columns: list[tuple[str, int, NDArray[Any]]] = [
-        (name, number, chain.points[:, axis]) for axis, name in enumerate(COORDINATES)]
+        (name, number, chain.observed[:, axis]) for axis, name in enumerate(COORDINATES)]
     if chain.hands is not None:
         columns.append(('hand', UINT8, chain.hands))
     if chain.features.any():
@@ -335,7 +340,8 @@ def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str, *,
     return types.build(
         'sensor_msgs/msg/PointCloud2', header=types.header(stamp, frame_id), height=1, width=len(chain),
         fields=fields, is_bigendian=False, point_step=dtype.itemsize,
-        row_step=dtype.itemsize * len(chain), data=types.octets(table.tobytes()), is_dense=True)
+        row_step=dtype.itemsize * len(chain), data=types.octets(table.tobytes()),
+        is_dense=bool(chain.seen.all()))
 
 
 def action_trajectory(types: MessageTypes, action: ActionMessage) -> Any:

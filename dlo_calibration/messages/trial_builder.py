@@ -15,7 +15,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, length_change
 from dlo_calibration.model.trial import Goal, Trial
 
 Message = Union[ChainMessage, ActionMessage]
@@ -159,7 +159,9 @@ class TrialBuilder:
                 str(goal), f'{len(goal.chain)} points',
                 f'{len(start.chain)} points as in {start}',
                 'send the same material points before and after the action')
-        change = abs(goal.length - start.length) / start.length * 100
+        if not goal.chain.seen.all():
+            goal = replace(goal, chain=goal.chain.put_back(start.chain.arc_lengths()))
+        change = length_change(start.chain, goal.chain)
         if change > options.length_tolerance:
             raise InputError(
                 str(goal), f'a length of {goal.length:.4g} m ({change:.0f} % from the '
@@ -211,7 +213,12 @@ class TrialBuilder:
         elapsed = start.stamp - earlier.stamp
         if elapsed >= NANOSECONDS // 10 or len(earlier.chain) != len(start.chain):
             return None
-        return (start.chain.points - earlier.chain.points) * (NANOSECONDS / elapsed)
+        velocity = (start.chain.points - earlier.chain.points) * (NANOSECONDS / elapsed)
+        both = start.chain.seen & earlier.chain.seen
+        if both.all() or not both.any():
+            return velocity if both.any() else None
+        places = start.chain.arc_lengths()
+        return np.stack([np.interp(places, places[both], one[both]) for one in velocity.T], axis=1)
 
     def lacks(self) -> str:
         """Return, in words, the messages that are missing; empty where the trial is complete."""

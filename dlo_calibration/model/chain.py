@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -83,21 +83,47 @@ def interpolation_matrix(knots: Floats, at: Floats) -> Floats:
     return bezier_curve(knots, np.eye(len(knots)), at)
 
 
+def put_back(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
+    """
+    Return (n, 3) points [m] whose unseen ones lie on the curve through the others, see `bezier_curve`.
+
+    Beyond the first and the last seen point, the DLO goes on straight.
+
+    :param seen: (n,) which points were seen, at least three.
+    :param places: (n,) increasing; arc lengths of the points, in any unit.
+    """
+    kept = np.flatnonzero(seen)
+    knots, values = places[kept], points[kept]
+    found = bezier_curve(knots, values, places)
+    for end, beyond in ((0, np.arange(kept[0])), (-1, np.arange(kept[-1] + 1, len(points)))):
+        if len(beyond):
+            near = knots[end] + (1e-3 if end == 0 else -1e-3) * np.ptp(knots[[end, 1 if end == 0 else -2]])
+            slope = (bezier_curve(knots, values, np.array([near]))[0] - values[end]) / (near - knots[end])
+            found[beyond] = values[end] + (places[beyond] - knots[end])[:, None] * slope
+    found[kept] = values
+    return found
+
+
 @dataclass(frozen=True)
 class Chain:
     """
     Ordered points along a DLO, first to last.
 
-    :param points: (n, 3) positions [m], n >= 3, finite, at most
-        MAXIMUM_COORDINATE, neighbours apart.
+    A point with NaN was not seen.  If at least half of the points were, and three, it is put back, see
+    `put_back`, as if the points were equally spaced.
+
+    :param points: (n, 3) positions [m], n >= 3, at most MAXIMUM_COORDINATE, neighbours apart; in the chain,
+        all are finite.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
         None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.
+    :param seen: (n,) False for points that were not seen; None: all that are not NaN were.
     """
 
     points: Floats
     hands: NDArray[np.uint8] | None = None
     features: NDArray[np.bool_] = None  # type: ignore[assignment]  # __post_init__ makes it an array
+    seen: NDArray[np.bool_] = None  # type: ignore[assignment]  # likewise
 
     def __post_init__(self) -> None:
         points = frozen_array(self.points)
@@ -110,18 +136,31 @@ class Chain:
                 'chain', f'{len(points)} point(s)', 'at least 3',
                 'send the points along the whole DLO, first to last')
         check_size('chain', 'point', points)
-        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        bad = np.flatnonzero(np.isinf(points).any(axis=1))
         if len(bad):
             raise InputError(
-                'chain', f'NaN or infinity in point(s) {_listed(bad)}', 'finite coordinates in metres',
-                'leave such frames out, or fill the points before sending')
-        gaps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        same = np.flatnonzero(gaps < MINIMUM_SPACING)
+                'chain', f'infinity in point(s) {_listed(bad)}', 'coordinates in metres',
+                'leave such frames out, or send NaN for a point that was not seen')
+        object.__setattr__(self, 'points', points)
+        given = np.isfinite(points).all(axis=1)
+        seen = given if self.seen is None else given & self._annotation('seen', self.seen, bool)
+        least = max(3, -(-len(points) // 2))
+        if seen.sum() < least:
+            raise InputError(
+                'chain', f'{seen.sum()} of {len(points)} points that were seen, and NaN in point(s) '
+                f'{_listed(np.flatnonzero(~seen))}', f'at least {least} that were seen',
+                'observe the DLO from where less of it is hidden')
+        kept = np.flatnonzero(seen)
+        gaps = np.linalg.norm(np.diff(points[kept], axis=0), axis=1)
+        same = kept[:-1][gaps < MINIMUM_SPACING]
         if len(same):
             raise InputError(
                 'chain', f'coincident neighbours after point(s) {_listed(same)}',
                 f'neighbours at least {MINIMUM_SPACING} m apart', 'remove the repeated points')
-        object.__setattr__(self, 'points', points)
+        object.__setattr__(self, 'seen', frozen_array(seen, bool))
+        if not given.all():
+            places = np.arange(float(len(points)))
+            object.__setattr__(self, 'points', frozen_array(put_back(points, seen, places)))
         if self.hands is not None:
             object.__setattr__(self, 'hands', self._annotation('hands', self.hands, np.uint8))
         features = np.zeros(len(points), bool) if self.features is None else self.features
@@ -137,6 +176,18 @@ class Chain:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def observed(self) -> Floats:
+        """The points, (n, 3) [m]; NaN where a point was not seen."""
+        return self.points if self.seen.all() else np.where(self.seen[:, None], self.points, np.nan)
+
+    def put_back(self, places: Floats) -> Chain:
+        """Return the chain, its unseen points put back by arc lengths of all points, (n,) in any unit."""
+        if self.seen.all():
+            return self
+        points = put_back(self.points, self.seen, places)
+        return self if np.array_equal(points, self.points) else replace(self, points=points)
 
     @property
     def length(self) -> float:
@@ -169,6 +220,28 @@ class Chain:
         samples = bezier_curve(knots, self.points, parameters)
         steps = np.linalg.norm(np.diff(samples, axis=0), axis=1)
         return parameters, np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def check_ends(thing: str, initial: Chain) -> None:
+    """
+    Refuse an initial chain that does not tell where an end of the DLO is.
+
+    :raises InputError: if more than one point at an end was not seen; `thing` is named.
+    """
+    for end, seen in (('first', initial.seen), ('last', initial.seen[::-1])):
+        if not seen[:2].any():
+            raise InputError(thing, f'an initial chain whose {end} {int(seen.argmax())} points were not seen',
+                             'at most one unseen point at each end',
+                             'observe the whole DLO before the action begins')
+
+
+def length_change(start: Chain, goal: Chain) -> float:
+    """Return by how much the length of a goal differs from the start's [%], where neighbours were seen."""
+    pairs = goal.seen[1:] & goal.seen[:-1]
+    if pairs.all() or not pairs.any():
+        return abs(goal.length - start.length) / start.length * 100
+    there, here = (float(np.diff(chain.arc_lengths())[pairs].sum()) for chain in (goal, start))
+    return abs(there - here) / here * 100
 
 
 def _listed(indices: NDArray[np.intp]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
 from dlo_calibration.model.named_actions import NamedAction
 
 PATHS = 'hand_paths'  # name of explicit paths
@@ -60,6 +60,7 @@ class Manipulation:
         if len(self.steps) > MOST_STEPS:
             raise InputError(thing, f'{len(self.steps)} actions in turn', f'at most {MOST_STEPS}',
                              'divide it into several trials')
+        check_ends(thing, self.start)
         for hand in (hand for step in self.steps for action in step.actions
                      if isinstance(action, Action) for hand in action.hands):
             if not all(0 <= grip < len(self.start) for grip in hand.grips):

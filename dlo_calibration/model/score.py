@@ -22,10 +22,10 @@ def focal_points(trial: Trial) -> NDArray[np.intp]:
     """
     Return the index of the focal point of each goal, (g,), the paper's p_ref.
 
-    It is the point of the goal that is nearest to a hand that holds the DLO, else the first point.
+    It is the seen point of the goal that is nearest to a hand that holds the DLO, else the first seen point.
     """
-    points, times = observed(trial), np.array([goal.time for goal in trial.goals])
-    nearest, index = np.full(len(times), np.inf), np.zeros(len(times), np.intp)
+    points, times, seen = observed(trial), np.array([goal.time for goal in trial.goals]), seen_points(trial)
+    nearest, index = np.full(len(times), np.inf), np.asarray(seen.argmax(axis=1), np.intp)
     hands = trial.hands
     for name in dict.fromkeys(hand.name for hand in hands):
         paths = [hand for hand in hands if hand.name == name]
@@ -34,6 +34,7 @@ def focal_points(trial: Trial) -> NDArray[np.intp]:
         for k, path in enumerate(paths):
             rows = np.flatnonzero((latest == k) & (kept | (times <= path.end)))
             away = np.linalg.norm(points[rows] - path.positions_at(times[rows])[:, None], axis=2)
+            away[~seen[rows]] = np.inf
             nearer = away.min(axis=1) < nearest[rows]
             index[rows[nearer]] = away[nearer].argmin(axis=1)
             nearest[rows[nearer]] = away[nearer].min(axis=1)
@@ -45,7 +46,7 @@ def feature_points(trial: Trial) -> NDArray[np.bool_]:
     Return which points of each goal are geometric features, (g, n).
 
     They are local maxima and minima in z, points that a hand has gripped, and
-    points that an annotator marked.
+    points that an annotator marked, as far as they were seen.
     """
     features = np.stack([goal.chain.features for goal in trial.goals]) | trial.initial.features
     rise = np.sign(np.diff(observed(trial)[:, :, 2], axis=1))
@@ -53,12 +54,17 @@ def feature_points(trial: Trial) -> NDArray[np.bool_]:
     times = np.array([goal.time for goal in trial.goals])
     for hand in trial.hands:
         features[np.ix_(hand.start <= times, np.array(hand.grips))] = True
-    return features
+    return np.asarray(features & seen_points(trial))
 
 
 def observed(trial: Trial) -> Floats:
     """Return the points of all goals of a trial, (g, n, 3) [m]."""
     return np.stack([goal.chain.points for goal in trial.goals])
+
+
+def seen_points(trial: Trial) -> NDArray[np.bool_]:
+    """Return which points of all goals of a trial were seen, (g, n)."""
+    return np.stack([goal.chain.seen for goal in trial.goals])
 
 
 def difference_score(goal: Floats, current: Floats, reference: int,
@@ -91,10 +97,16 @@ def difference_vector(goal: Floats, current: Floats, reference: int,
 
 
 class TrialScore:
-    """The difference score and the residuals of one trial; the terms of its goals are computed once."""
+    """
+    The difference score and the residuals of one trial; the terms of its goals are computed once.
+
+    Points of goals that were not seen are left out of all sums.
+    """
 
     def __init__(self, trial: Trial) -> None:
         self._points = observed(trial)
+        seen = seen_points(trial)
+        self._seen = None if seen.all() else seen
         self._reference = focal_points(trial)
         self._features = feature_points(trial).astype(float)
         self._shape = self._extent(self._points)
@@ -102,7 +114,8 @@ class TrialScore:
     def _extent(self, chains: Floats) -> Floats:
         """Return the sums over the points of |p_ref - p_i| by coordinate, (g, 3) [m]."""
         references = chains[np.arange(len(chains)), self._reference]
-        return np.asarray(np.abs(references[:, None, :] - chains).sum(axis=1))
+        away = np.abs(references[:, None, :] - chains)
+        return np.asarray((away if self._seen is None else away * self._seen[:, :, None]).sum(axis=1))
 
     def __call__(self, chains: Floats) -> float:
         """Return the score [cm] of simulated (g, n, 3) [m] chains, averaged over the g goals."""
@@ -113,13 +126,19 @@ class TrialScore:
         return float(np.linalg.norm(difference, axis=1).mean()) * 100
 
     def residuals(self, chains: Floats) -> Floats:
-        """Return simulated minus observed coordinates, (g * n * 3,) [m], goal by goal."""
-        return np.asarray(chains - self._points).ravel()
+        """Return simulated minus observed coordinates of the p seen points, (3 p,) [m], goal by goal."""
+        away = np.asarray(chains - self._points)
+        return (away if self._seen is None else away[self._seen]).ravel()
+
+
+def differences(trial: Trial, chains: Floats) -> Floats:
+    """Return simulated minus observed points, (g, n, 3) [m]; NaN where a point was not seen."""
+    return np.asarray(chains - np.stack([goal.chain.observed for goal in trial.goals]))
 
 
 def residuals(trial: Trial, chains: Floats) -> Floats:
-    """Return simulated minus observed coordinates, (g * n * 3,) [m], goal by goal."""
-    return np.asarray(chains - observed(trial)).ravel()
+    """Return simulated minus observed coordinates of the p seen points, (3 p,) [m], goal by goal."""
+    return differences(trial, chains)[seen_points(trial)].ravel()
 
 
 def distances(residual: Floats) -> Floats:
@@ -130,7 +149,7 @@ def distances(residual: Floats) -> Floats:
 @dataclass(frozen=True)
 class PointErrors:
     """
-    Errors over all goal points, including those that a hand holds.
+    Errors over all seen goal points, including those that a hand holds.
 
     :param mean: mean Euclidean distance [m].
     :param rms: root of the mean squared distance [m].

@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
+
+VIEWS = 25  # goals, evenly spread, that tell where unseen points of an initial chain are
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class Trial:
     """
     One observed manipulation: the DLO before it, the actions of the hands, and the observed goals.
 
-    :param initial: the DLO before the action; point i is the same material point in all chains.
+    :param initial: the DLO before the action; point i is the same material point in all chains. Where
+        points of it were not seen, the goals that show them tell how far along the DLO they are.
     :param actions: one or more, in the order of their start.
     :param goals: one or more, in the order of their time.
     :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
@@ -80,6 +84,9 @@ class Trial:
                 if not all(0 <= grip < n for grip in hand.grips):
                     raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
                                      f'points 0 to {n - 1}', 'correct the gripped points')
+        check_ends(thing, self.initial)
+        if not self.initial.seen.all():
+            object.__setattr__(self, 'initial', self.initial.put_back(_shown_places(self.initial, goals)))
         object.__setattr__(self, 'actions', actions)
         object.__setattr__(self, 'goals', goals)
         if self.velocity is not None:
@@ -119,6 +126,23 @@ class Trial:
         if goal.time <= hand.end:
             return goal.time >= hand.start
         return hand.name in goal.held_by
+
+
+def _shown_places(initial: Chain, goals: Sequence[Goal]) -> Floats:
+    """
+    Return arc lengths, (n,) [m] from 0, of the points of an initial chain of which some were not seen.
+
+    A segment that it does not show has its mean length in the goals, or else the mean of all segments.
+    """
+    few = [goals[k].chain for k in np.linspace(0, len(goals) - 1, min(len(goals), VIEWS)).astype(int)]
+    chains = [initial, *few]
+    lengths = np.array([np.diff(chain.arc_lengths()) for chain in chains])
+    shown = np.array([chain.seen[1:] & chain.seen[:-1] for chain in chains])
+    shown[1:] &= ~shown[0]
+    counts = shown.sum(axis=0)
+    means = (lengths * shown).sum(axis=0) / np.maximum(counts, 1)
+    usual = means[counts > 0].mean() if counts.any() else 1.0
+    return np.concatenate([[0.0], np.cumsum(np.where(counts > 0, means, usual))])
 
 
 def shown_goals(count: int) -> list[int]:

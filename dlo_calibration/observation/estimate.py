@@ -119,10 +119,13 @@ def _resting(trials: Sequence[Trial], table_height: float | None, sigma: float) 
             hands = trial.holding(goal)
             clamps = [grip for hand in hands if len(hand.grips) > 1 for grip in hand.grips]
             pins = [hand.grips[0] for hand in hands if len(hand.grips) == 1]
-            points = goal.chain.points
-            touching = _near_itself(points, places, sigma)
+            # Points that were not seen tell nothing, but a hand holds the DLO also there.
+            kept = np.flatnonzero(goal.chain.seen | np.isin(np.arange(len(goal.chain)), [*clamps, *pins]))
+            points, along = goal.chain.points[kept], places[kept]
+            clamps, pins = (np.searchsorted(kept, held).tolist() for held in (clamps, pins))
+            touching = _near_itself(points, along, sigma)
             for part in hanging_parts(points, level, margin, clamps, pins, touching):
-                found = balance(points, places, part, sigma)
+                found = balance(points, along, part, sigma)
                 if found is not None:
                     balances.append(found)
             if not hands:

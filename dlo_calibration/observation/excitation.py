@@ -11,7 +11,7 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.noise import noise
@@ -84,8 +84,13 @@ def _swinging(trials: Sequence[Trial]) -> list[tuple[Trial, Goal]]:
         return []
     sigma = np.nan_to_num(noise(trials))
     return [(trial, one) for trial, one, other in pairs
-            if np.sqrt(np.mean((other.chain.points - one.chain.points)**2))
-            > 4 * sigma + STILL * (other.time - one.time)]
+            if _apart(one.chain, other.chain) > 4 * sigma + STILL * (other.time - one.time)]
+
+
+def _apart(one: Chain, other: Chain) -> float:
+    """Return the root mean square of how far the coordinates that both chains show moved [m]."""
+    both = one.seen & other.seen
+    return float(np.sqrt(np.mean((other.points - one.points)[both]**2))) if both.any() else 0.0
 
 
 def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None

@@ -34,8 +34,8 @@ def noise(trials: Sequence[Trial]) -> float:
     for streamed in (False, True):
         some = [trial for trial in trials if _is_stream(trial) == streamed]
         if some:
-            along = noise_of([np.stack([trial.initial.points, *(goal.chain.points for goal in trial.goals)])
-                              for trial in some])
+            along = noise_of([np.stack([one.observed for one in (
+                trial.initial, *(goal.chain for goal in trial.goals))]) for trial in some])
             level = np.fmin(along, _noise_over_time(some)) if streamed else along
             levels += [float(level)] * len(some)
     known = np.array(levels)[np.isfinite(levels)]
@@ -46,13 +46,14 @@ def noise(trials: Sequence[Trial]) -> float:
 
 def _views(trial: Trial) -> tuple[Floats, Floats]:
     """
-    Return when the goals of a trial were seen, (g,) [s] increasing, and their points, (g, n, 3) [m].
+    Return when the goals of a trial were seen, (g,) [s] increasing, and their points, (g, n, 3) [m] or NaN.
 
     A chain that repeats the one before bit for bit is not a new view: trackers send the last one again.
     """
     times = np.array([goal.time for goal in trial.goals])
-    points = np.stack([goal.chain.points for goal in trial.goals])
-    new = np.append(True, (np.diff(times) > 0) & (points[1:] != points[:-1]).any(axis=(1, 2)))
+    points = np.stack([goal.chain.observed for goal in trial.goals])
+    changed = (points[1:] != points[:-1]) & np.isfinite(points[1:]) & np.isfinite(points[:-1])
+    new = np.append(True, (np.diff(times) > 0) & changed.any(axis=(1, 2)))
     return times[new], points[new]
 
 
@@ -81,18 +82,28 @@ def _noise_over_time(trials: Sequence[Trial]) -> float:
             weights = 1 / np.prod(gaps + np.eye(order + 1), axis=2)
             weights /= np.linalg.norm(weights, axis=1, keepdims=True)
             differences = sum(weights[:, k, None, None] * points[k:k + windows] for k in range(order + 1))
-            rows.setdefault(order, []).append(np.mean(differences**2, axis=(1, 2)))
-    spread = 2 / (9 * 3 * np.mean([len(trial.initial) for trial in trials]))
-    lower = (1 - spread + SLOW_SIGMAS * np.sqrt(spread))**3
-    slow = [np.quantile(np.concatenate(squares), SLOW) for squares in rows.values()]
-    return float(np.sqrt(min(slow) / lower))
+            shown = np.isfinite(differences[:, :, 0]).sum(axis=1)  # points that were seen all the time
+            differences, shown = differences[shown > 0], shown[shown > 0]
+            spread = 2 / (9 * 3 * shown)
+            lower = (1 - spread + SLOW_SIGMAS * np.sqrt(spread))**3
+            rows.setdefault(order, []).append(np.nanmean(differences**2, axis=(1, 2)) / lower)
+    slow = [np.quantile(found, SLOW) for found in map(np.concatenate, rows.values()) if len(found)]
+    return float(np.sqrt(min(slow, default=np.nan)))
 
 
 def noise_of(observed: Sequence[Floats]) -> float:
-    """Return the noise level along the DLO, from the chains of each trial: (g, n, 3) [m], same points."""
+    """
+    Return the noise level along the DLO, from the chains of each trial: (g, n, 3) [m], same points.
+
+    NaN is a point that was not seen; differences over it are left out.
+    """
     rows: dict[int, list[Floats]] = {}
     for chains in observed:
-        steps = np.linalg.norm(np.diff(chains, axis=1), axis=2).mean(axis=0)
+        steps = np.linalg.norm(np.diff(chains, axis=1), axis=2)
+        shown = np.isfinite(steps)
+        usual = steps[shown].mean() if shown.any() else 1.0
+        steps = np.where(shown.any(axis=0), np.where(shown, steps, 0.0).sum(axis=0)
+                         / np.maximum(shown.sum(axis=0), 1), usual)
         # The mean noise along the DLO went into the arc lengths, so it is missing in the differences.
         seen = 3 - 1 / len(chains)
         for order, weights in _differences(np.concatenate([[0.0], np.cumsum(steps)])).items():
@@ -122,9 +133,11 @@ def _differences(places: Floats) -> dict[int, Floats]:
 
 
 def _squared_differences(weights: Floats, chains: Floats) -> Floats:
-    """Return the squared lengths of all differences of (g, n, 3) chains."""
-    differences = weights @ chains
-    return np.asarray(np.einsum('gij,gij->gi', differences, differences).ravel())
+    """Return the squared lengths of all differences of (g, n, 3) chains, but those over NaN."""
+    hidden = np.isnan(chains[:, :, 0])
+    differences = weights @ np.nan_to_num(chains) if hidden.any() else weights @ chains
+    squares = np.asarray(np.einsum('gij,gij->gi', differences, differences))
+    return squares[hidden.astype(float) @ (weights != 0).T == 0] if hidden.any() else squares.ravel()
 
 
 def _noise_level(squares: dict[int, list[Floats]]) -> float:
@@ -132,9 +145,8 @@ def _noise_level(squares: dict[int, list[Floats]]) -> float:
     estimates = []
     for rows in squares.values():
         values = np.concatenate(rows)
-        values = values[values <= KINK * np.median(values)]
         if len(values):
-            estimates.append(values.mean())
+            estimates.append(values[values <= KINK * np.median(values)].mean())
     return float(np.sqrt(min(estimates))) if estimates else float('nan')
 
 

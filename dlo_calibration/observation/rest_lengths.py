@@ -47,10 +47,17 @@ def with_shared_places(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _segments(trial: Trial) -> Floats:
-    """Return the lengths of the segments, (v, n - 1) [m], in v timed goals, without the effect of noise."""
+    """
+    Return the lengths of the segments, (v, n - 1) [m], in v timed goals, without the effect of noise.
+
+    Where an end of a segment was not seen, it has the mean of the goals that show it, if there are any.
+    """
     seen = [goal.chain for goal in trial.goals if not goal.stable]
     sigma = noise([trial])
     chains = [seen[k] for k in np.linspace(0, len(seen) - 1, VIEWS).astype(int)]
+    shown = np.array([chain.seen[1:] & chain.seen[:-1] for chain in chains])
     if sigma > NO_NOISE:
         chains = [Chain(smooth(chain.points, sigma)) for chain in chains]
-    return np.array([np.diff(chain.arc_lengths()) for chain in chains])
+    lengths = np.array([np.diff(chain.arc_lengths()) for chain in chains])
+    shown[:, ~shown.any(axis=0)] = True
+    return np.where(shown, lengths, (lengths * shown).sum(axis=0) / shown.sum(axis=0))

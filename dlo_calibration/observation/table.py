@@ -39,7 +39,7 @@ def lying_level(chain: Chain, table_height: float) -> float | None:
 
 def _lowest_level(chain: Chain) -> float:
     """Return the median height [m] of the lowest points of a chain; infinity if there are too few of them."""
-    z = chain.points[:, 2]
+    z = chain.points[chain.seen, 2]
     lowest = z[z < z.min() + RESTING_BAND]
     return float(np.median(lowest)) if len(lowest) >= max(3, 0.15 * len(z)) else np.inf
 

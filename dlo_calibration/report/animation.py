@@ -132,7 +132,7 @@ class _Scene:
 
     def _prepare(self, view: View, motion: Motion) -> tuple[View, Any, Any, Mapping[str, Any]]:
         view.draw_start(self._captions.start)
-        goal = self._trial.goals[-1].chain.points if self._captions.goal else np.full((1, 3), np.nan)
+        goal = self._trial.goals[-1].chain.observed if self._captions.goal else np.full((1, 3), np.nan)
         measured, = view.axes.plot(
             *view.flat(goal), 'o', color=OBSERVED, markersize=4, alpha=0.5, linestyle='none', zorder=2,
             label='latest measured chain' if self._tracked else self._captions.goal or None)
@@ -158,7 +158,7 @@ class _Scene:
         for view, measured, line, hands in self._moving:
             line.set_data(*view.flat(chain))
             if self._tracked:
-                measured.set_data(*view.flat(seen[-1].points))
+                measured.set_data(*view.flat(seen[-1].observed))
             for name, (position, closed) in current.items():
                 hands[name].set_data(*view.flat(position[None]))
                 hands[name].set_markerfacecolor(self._colours[name] if closed else 'none')

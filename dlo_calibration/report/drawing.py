@@ -18,7 +18,7 @@ from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.quantity import interval, measured, number
-from dlo_calibration.model.score import PointErrors, residuals
+from dlo_calibration.model.score import differences, PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.figure import (
     add_legend,
@@ -75,7 +75,7 @@ class Drawn:
         band = None
         if found is not None and found.regular:
             by_goal = ResidualLayout.of(result.trials).by_point(found.band)[k]
-            band = by_goal[shown_goals(len(trial.goals))].max(axis=0)
+            band = np.fmax.reduce(by_goal[shown_goals(len(trial.goals))], axis=0)
         return cls(trial, result.chains[k], hand_colours([trial]), math.nan if found is None else found.noise,
                    band)
 
@@ -145,9 +145,8 @@ def trial_panels(drawn: Drawn) -> list[Panel]:
     """Draw a trial for the page: from above, from the side, point errors, and residuals by coordinate."""
     name, chains = drawn.trial.name, drawn.chains
     assert chains is not None
-    off = residuals(drawn.trial, chains).reshape(chains.shape)
-    errors = PointErrors.of(off)
-    by_axis = (f'{axis}: {interval(values.min(), values.max(), "m")}'
+    off, errors = differences(drawn.trial, chains), PointErrors.of(residuals(drawn.trial, chains))
+    by_axis = (f'{axis}: {interval(np.nanmin(values), np.nanmax(values), "m")}'
                for axis, values in zip('xyz', off[-1].T, strict=True))
     return [
         panel(lambda axes: draw_view(axes, drawn, above=True),
@@ -233,7 +232,7 @@ class View:
         :param colour: of this goal among several; None: it is the only one.
         """
         goal = self.trial.goals[index]
-        seen = self.flat(goal.chain.points)
+        seen = self.flat(goal.chain.observed)
         when = 'after the action' if colour is None else f'after {number(goal.time)} s'
         self.axes.plot(*seen, 'o', color=colour or OBSERVED, markersize=4.5, linestyle='none',
                        label=f'{when}, measured', zorder=3)
@@ -277,7 +276,7 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
     trial, chains = drawn.trial, drawn.chains
     places = trial.initial.arc_lengths()
     for goal, colour in drawn.goals():
-        seen = trial.goals[goal].chain.points
+        seen = trial.goals[goal].chain.observed
         other = trial.initial.points if chains is None else chains[goal]
         axes.plot(places, np.linalg.norm(seen - other, axis=1) * 1e3, 'o-', markersize=4, linewidth=1,
                   color=colour or (OBSERVED if chains is None else SIMULATED),
@@ -312,7 +311,7 @@ def _draw_differences(axes: Axes, drawn: Drawn) -> None:
         axes.axhspan(-reach, reach, color=FAINT, alpha=0.25, linewidth=0,
                      label='noise of the measured points (90 % interval)')
     for axis, values, colour, dashes in zip(
-            ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.points).T, (BLUE, YELLOW, GREEN),
+            ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.observed).T, (BLUE, YELLOW, GREEN),
             ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
         axes.plot(places, values * 1e3, color=colour, linestyle=dashes, linewidth=1.8, label=f'in {axis}')
     last = '' if len(trial.goals) == 1 else f', after {number(goal.time)} s'

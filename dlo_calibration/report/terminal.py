@@ -223,7 +223,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     for one in filter(lambda one: one['hint'], unknown.values()):
         out.print(escape(f'hint: {one["hint"]}'), soft_wrap=True)
     if about['trials']:
-        head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'annotated')
+        head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'remarks')
         out.print(rows_table('trials', head, [
             (str(trial['number']), trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
              ', '.join(f"{shortened(hand['name'], 100)} (points {' '.join(map(str, hand['grips']))})"
@@ -231,8 +231,9 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
              f"{number(trial['duration_s'])} s",
              ', '.join(word for word, there in (
-                 ('hands', trial['annotated_hands']),
-                 (f"{trial['annotated_features']} features", trial['annotated_features'])) if there) or '-')
+                 ('annotated hands', trial['annotated_hands']),
+                 (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
+                (f"{trial['unseen_points']} points not seen", trial['unseen_points'])) if there) or '-')
             for trial in about['trials']]))
     for title in ('refusals', 'problems'):
         for text in about[title]:

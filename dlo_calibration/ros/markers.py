@@ -80,12 +80,13 @@ def _same(trial: Trial, other: Trial) -> bool:
 def _trial_markers(brush: Brush, trial: Trial, chains: Floats | None, k: int) -> Iterator[Any]:
     yield brush.line('initial', 0, trial.initial.points, INITIAL_COLOUR)
     for goal in shown_goals(len(trial.goals)):
-        points = trial.goals[goal].chain.points
-        yield brush.spheres('goal', 2 * goal, points, [GOAL_COLOUR], 1.2)
-        yield brush.line('goal', 2 * goal + 1, points, GOAL_COLOUR, 0.5)
+        chain = trial.goals[goal].chain
+        yield brush.spheres('goal', 2 * goal, chain.points[chain.seen], [GOAL_COLOUR], 1.2)
+        yield brush.line('goal', 2 * goal + 1, chain.points, GOAL_COLOUR, 0.5)
         if chains is not None:
             yield brush.line('simulated', goal, chains[goal], SIMULATED_COLOUR)
-            yield from _error_markers(brush, goal, points, chains[goal], trial.initial.length)
+            yield from _error_markers(brush, goal, chain.points[chain.seen], chains[goal][chain.seen],
+                                      trial.initial.length)
     for place, hand in enumerate(trial.hands[:MOST_HANDS]):
         yield from hand_markers(brush, 3 * place, hand, trial.initial.points)
     text = trial.name

@@ -103,3 +103,36 @@ def test_between_compared_goals_a_value_is_interpolated_in_time():
     few = (toy_trial(TRUTH), toy_trial(TRUTH))
     values = np.random.default_rng(0).random(22)
     assert np.array_equal(at_every_goal(values, few), values)
+
+
+def hiding(trial, share, seed=0):
+    """Return a trial in whose chains a share of the points, at random, was not seen."""
+    random = np.random.default_rng(seed)
+
+    def hidden(chain, first=0):
+        there = np.arange(first, len(chain) - first)
+        points = chain.points.copy()
+        points[random.choice(there, round(share * len(chain)), replace=False)] = np.nan
+        return replace(chain, points=points)
+
+    return replace(trial, initial=hidden(trial.initial, 1), goals=tuple(
+        replace(goal, chain=hidden(goal.chain)) for goal in trial.goals))
+
+
+def test_points_that_were_not_seen_have_no_residuals_and_the_others_keep_theirs():
+    trials, point = stream(), np.full(4, 0.3)
+    some = tuple(replace(hiding(trial, 0.2), initial=trial.initial) for trial in trials)
+    whole, thin, compared = (
+        Evaluator(those, ParameterSpace(), ToySimulator(), every).evaluate(0, point).residuals
+        for those, every in ((trials, True), (some, True), (some, False)))
+    layout = ResidualLayout.of(some)
+    assert layout.rows[-1].stop == len(thin) < len(whole)
+    assert ResidualLayout.compared(some).rows[-1].stop == len(compared) == len(compared_rows(some))
+    for trial, found, expected in zip(some, layout.chains(thin), ResidualLayout.of(trials).chains(whole),
+                                      strict=True):
+        seen = np.stack([goal.chain.seen for goal in trial.goals])
+        assert np.isnan(found[~seen]).all()
+        assert np.array_equal(found[seen], expected[seen])
+    sizes = at_every_goal(np.linalg.norm(compared.reshape(-1, 3), axis=1), some)
+    assert sizes.shape == (len(thin) // 3,)
+    assert np.isfinite(sizes).all()

@@ -562,13 +562,13 @@ def test_trials_of_a_session(session):
 def test_one_bad_message_costs_no_trial(tmp_path):
     cloud = chain_cloud(TYPES, Chain(chain_points(0)), START + 4 * SECOND, 'world')
     cloud.data = cloud.data.copy()
-    cloud.data[:8] = np.frombuffer(np.array(np.nan).tobytes(), np.uint8)
+    cloud.data[:8] = np.frombuffer(np.array(np.inf).tobytes(), np.uint8)
     with SessionWriter(tmp_path / 'session') as writer:
         write(writer, [*MESSAGES[:3], (GOAL, cloud, START + 4 * SECOND), *MESSAGES[3:]])
     trials, refusals = session_trials(read_session(writer.path), Options())
     assert len(trials) == 3
     refusal, = refusals
-    assert f'goal_chain stamped {START // SECOND + 4} s' in refusal and 'NaN' in refusal
+    assert f'goal_chain stamped {START // SECOND + 4} s' in refusal and 'infinity' in refusal
 
 
 @pytest.mark.parametrize('number', range(1, 6))

@@ -174,8 +174,8 @@ def test_hand_beyond_eight_is_refused(types):
 
 
 @pytest.mark.parametrize(('index', 'value', 'words'), [
-    (5, np.nan, 'NaN or infinity in point(s) 5'),
-    (6, np.inf, 'NaN or infinity in point(s) 6'),
+    (slice(5, 16), np.nan, '10 of 21 points that were seen, and NaN in point(s) 5, 6, 7, 8, 9 and 6 more'),
+    (6, np.inf, 'infinity in point(s) 6'),
     (8, curve()[7], 'coincident neighbours after point(s) 7'),
     (9, 1e30, 'a coordinate of 1e+30 m in point 9'),
 ])

@@ -107,3 +107,16 @@ def test_hands_with_times_of_their_own_share_the_waypoints_of_one_message():
     np.testing.assert_allclose(message.positions[:, 1, 2], [0, 0, 0.1, 0])
     np.testing.assert_allclose(2 * np.arcsin(message.orientations[:, 0, 2]), np.radians([0, 45, 90, 90]))
     np.testing.assert_array_equal(message.orientations[:, 1], np.tile([0, 0, 0, 1], (4, 1)))
+
+
+def test_points_that_were_not_seen_stay_unseen():
+    hidden = [POINTS + (0, 0.01 * k, 0) for k in range(3)]
+    for k, points in enumerate(hidden):
+        points[k + 1] = np.nan
+    velocity = np.tile([0.2, 0.0, 0.1], (6, 1))
+    trial = Trial('trial 1', Chain(hidden[0]), (moved('left', 0, 0.0, ASIDE),),
+                  (Goal(Chain(hidden[1]), 0.5, False), Goal(Chain(hidden[2]), 5.0)), velocity)
+    found, = collected([trial])
+    for one, other in zip([found.initial, *(goal.chain for goal in found.goals)], hidden, strict=True):
+        np.testing.assert_array_equal(one.observed, other)
+    np.testing.assert_allclose(found.velocity, velocity, atol=1e-9)

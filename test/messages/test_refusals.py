@@ -88,7 +88,7 @@ def test_a_repeated_refusal_is_told_at_once_then_at_growing_intervals_and_never_
 
 
 def test_session_with_thousands_of_bad_messages_is_told_in_one_line_for_each_reason(tmp_path, capsys):
-    bad = [(GOAL, with_point(4, float('nan'))(TYPES)) for _ in range(300)]
+    bad = [(GOAL, with_point(4, float('inf'))(TYPES)) for _ in range(300)]
     for k, (_, message) in enumerate(bad):
         message.header.stamp.sec = 200 + k
     path = write_session(tmp_path / 'session.mcap', [*session_messages(TYPES, 1), *bad])

@@ -3,7 +3,7 @@
 
 """The chain: a curve through all its points, lengths along it, and what is refused."""
 
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -133,9 +133,9 @@ REFUSED = {
     'shape': ({'points': np.zeros((5, 2))}, '(5, 2)', '(n, 3)', 'x y z'),
     'flat': ({'points': np.arange(9.0)}, '(9,)', '(n, 3)', 'x y z'),
     'few': ({'points': LINE[:2]}, '2 point', 'at least 3', 'whole DLO'),
-    'nan': ({'points': np.where(LINE == 0.25, np.nan, LINE)}, 'NaN or infinity in point(s) 2', 'finite',
-            'leave such frames out'),
-    'infinite': ({'points': np.where(LINE == 0.6, -np.inf, LINE)}, 'NaN or infinity in point(s) 4', 'finite',
+    'nan': ({'points': np.where(LINE > 0.1, np.nan, LINE)}, 'NaN in point(s)', 'at least 3 that were seen',
+            'less of it is hidden'),
+    'infinite': ({'points': np.where(LINE == 0.6, -np.inf, LINE)}, 'infinity in point(s) 4', 'metres',
                  'leave such frames out'),
     'coincident': ({'points': LINE[[0, 1, 1, 2, 3]]}, 'coincident neighbours after point(s) 1', 'apart',
                    'remove the repeated points'),
@@ -157,7 +157,7 @@ def test_refusals_say_what_came_what_was_expected_and_what_to_do(name):
 
 
 def test_many_bad_points_are_counted_not_listed():
-    with pytest.raises(InputError, match=r'point\(s\) 0, 1, 2, 3, 4 and 95 more'):
+    with pytest.raises(InputError, match=r'0 of 100 points .*NaN in point\(s\) 0, 1, 2, 3, 4 and 95 more'):
         Chain(np.full((100, 3), np.nan))
 
 
@@ -179,3 +179,35 @@ def test_times_that_no_clock_gives_are_refused(time):
         Goal(chain, time)
     with pytest.raises(InputError):
         Hand('left', (0,), np.array([time]), np.zeros((1, 3)))
+
+
+def test_points_that_were_not_seen_lie_on_the_curve_through_the_others_and_are_known_as_such():
+    turn = np.linspace(0, 1.5, 16)
+    points = 0.3 * np.stack([np.sin(turn), 1 - np.cos(turn), np.zeros(16)], axis=1)
+    hidden = points.copy()
+    hidden[[4, 9], 0] = np.nan  # one coordinate is enough
+    hidden[10] = np.nan
+    chain = Chain(hidden, hands=np.arange(16) == 4)
+    assert np.flatnonzero(~chain.seen).tolist() == [4, 9, 10]
+    np.testing.assert_allclose(chain.points, points, atol=3e-4)  # neighbours are 30 mm apart
+    np.testing.assert_array_equal(chain.points[chain.seen], points[chain.seen])
+    assert np.flatnonzero(np.isnan(chain.observed).any(axis=1)).tolist() == [4, 9, 10]
+    assert replace(chain, hands=None).seen.tolist() == chain.seen.tolist()
+    assert not chain.seen.flags.writeable
+    assert Chain(points).seen.all()
+
+
+def test_an_end_that_was_not_seen_goes_on_straight():
+    even = Chain(np.stack([np.linspace(0, 1, 7), np.zeros(7), np.zeros(7)], axis=1))
+    points = even.points.copy()
+    points[[0, -1]] = np.nan
+    np.testing.assert_allclose(Chain(points).points, even.points, atol=1e-9)
+
+
+def test_half_of_the_points_are_enough():
+    points = np.stack([np.linspace(0, 1, 8), np.zeros(8), np.zeros(8)], axis=1)
+    points[[1, 3, 5, 6]] = np.nan
+    assert Chain(points).length == pytest.approx(1.0)
+    points[2] = np.nan
+    with pytest.raises(InputError, match='3 of 8 points that were seen.*at least 4 that were seen.*hidden'):
+        Chain(points)

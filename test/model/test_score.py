@@ -148,3 +148,21 @@ def test_point_errors_by_hand():
     assert errors.rms == pytest.approx(np.sqrt((0.005**2 + 0.015**2) / 3))
     assert errors.max == pytest.approx(0.015)
     assert errors.mean_abs == pytest.approx(0.028 / 9)
+
+
+def test_points_that_were_not_seen_count_nowhere():
+    random = np.random.default_rng(1)
+    goal, current = random.random((9, 3)), random.random((9, 3))
+    hidden = goal.copy()
+    hidden[[0, 5]] = np.nan
+    kept = [1, 2, 3, 4, 6, 7, 8]
+    one = trial(random.random((9, 3)), Goal(Chain(hidden), 2.0))
+    whole = Trial('w', Chain(one.initial.points[kept]), (Action((hand('left', 0, 1, (0,), (9, 9, 9)),)),),
+                  (Goal(Chain(goal[kept], features=feature_points(one)[0][kept]), 2.0),))
+    assert focal_points(one).tolist() == [1]
+    assert not feature_points(one)[0][[0, 5]].any()
+    assert residuals(one, current[None]).tolist() == residuals(whole, current[None, kept]).tolist()
+    assert TrialScore(one).residuals(current[None]).tolist() == residuals(one, current[None]).tolist()
+    reference, features = 0, np.flatnonzero(feature_points(one)[0][kept])
+    assert TrialScore(one)(current[None]) == pytest.approx(
+        difference_score(goal[kept], current[kept], reference, features))

@@ -3,6 +3,7 @@
 
 """The trial: order of actions and goals, which hands hold when, and what is refused."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -126,3 +127,25 @@ def test_clamps_are_neighbours_that_one_hand_holds_from_the_start():
     assert trial([Action([hand('a', 0.0, 1.0, (1, 0)), hand('b', 0.0, 1.0, (3, 5))]),
                   Action([hand('c', 1.5, 1.9, (2, 3))])]).clamped == (0,)
     assert trial().clamped == ()
+
+
+UNEVEN = np.array([0.0, 0.02, 0.1, 0.16, 0.3, 0.34, 0.4, 0.5])
+
+
+def uneven(hidden):
+    points = np.stack([UNEVEN, np.zeros(8), np.zeros(8)], axis=1)
+    points[hidden] = np.nan
+    return Chain(points)
+
+
+def test_a_point_unseen_in_the_initial_chain_is_where_the_goals_show_it():
+    goals = [Goal(uneven([6]), 2.0), Goal(uneven([1, 4]), 3.0)]
+    found = Trial('t', uneven([3, 7]), (Action((hand('left', 0.0, 1.0),)),), goals)
+    np.testing.assert_allclose(found.initial.points[:, 0], UNEVEN, atol=2e-3)
+    assert np.flatnonzero(~found.initial.seen).tolist() == [3, 7]
+    assert replace(found, name='u').initial is found.initial
+
+
+def test_an_initial_chain_without_an_end_is_refused():
+    with pytest.raises(InputError, match='whose last 2 points were not seen, expected at most one'):
+        Trial('t', uneven([6, 7]), (Action((hand('left', 0.0, 1.0),)),), [Goal(uneven([0, 1]), 2.0)])

@@ -3,6 +3,8 @@
 
 """The noise level of observed chains, and its removal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from resting import trial_of
@@ -221,3 +223,23 @@ def test_places_are_even_where_noise_explains_that_they_are_not():
     uneven = np.stack([even**2, 0 * even, 0 * even], axis=1)
     assert places_along(uneven, 1e-6) == pytest.approx(even**2, rel=1e-4)
     assert places_along(uneven, 0.0).tolist() == pytest.approx((even**2).tolist(), abs=1e-15)
+
+
+def hiding(trial, share):
+    """Return a trial in whose goals a share of the points, at random, was not seen."""
+    random = np.random.default_rng(5)
+
+    def hidden(chain):
+        points = chain.points.copy()
+        points[random.choice(len(points), round(share * len(points)), replace=False)] = np.nan
+        return Chain(points)
+
+    return replace(trial, goals=tuple(replace(goal, chain=hidden(goal.chain)) for goal in trial.goals))
+
+
+@pytest.mark.parametrize('share', [0.1, 0.3])
+def test_points_that_were_not_seen_do_not_change_the_noise(share):
+    stream = swinging(60, 0.1 * MILLIMETRE)
+    assert noise([hiding(stream, share)]) == pytest.approx(0.1 * MILLIMETRE, rel=0.1)
+    trials = noisy_arcs(40, True)
+    assert noise([hiding(trial, share) for trial in trials]) == pytest.approx(noise(trials), rel=0.12)

@@ -104,3 +104,17 @@ def test_a_calibration_uses_the_shared_lengths():
         used = Setting(trials, Options(), simulator).trials
     assert segments(used[1])[1:-1] == pytest.approx(segments(used[0])[1:-1], abs=1e-12)
     assert used[0].places.tolist() == with_shared_places(trials)[0].places.tolist()
+
+
+def test_points_that_were_not_seen_do_not_spoil_the_lengths():
+    random = np.random.default_rng(0)
+
+    def hidden(chain):
+        points = chain.points.copy()
+        points[random.random(len(points)) < 0.1] = np.nan
+        return Chain(points)
+
+    trials = [waving(seed) for seed in range(3)]
+    some = [replace(trial, goals=tuple(replace(goal, chain=hidden(goal.chain)) for goal in trial.goals))
+            for trial in trials]
+    assert error(with_shared_places(some)[0]) < 1.3 * error(with_shared_places(trials)[0])

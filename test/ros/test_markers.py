@@ -143,3 +143,13 @@ def test_errors_go_from_green_over_yellow_to_red():
     assert error_colour(0.015)[:2] == (1.0, 1.0)
     for share in (0.03, 1.0, math.inf):
         assert error_colour(share)[:2] == (1.0, 0.0)
+
+
+def test_points_that_were_not_seen_have_no_spheres(types):
+    trial = toy_trials(1)[0]
+    hidden = trial.goals[0].chain.points.copy()
+    hidden[[2, 5]] = np.nan
+    goals = (replace(trial.goals[0], chain=Chain(hidden)),)
+    spheres, line = shown(types, [replace(trial, goals=goals)])['trial_1/goal']
+    assert np.array_equal(points(spheres), np.delete(trial.goals[0].chain.points, [2, 5], axis=0))
+    assert len(line.points) == len(hidden)

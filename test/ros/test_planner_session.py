@@ -158,13 +158,13 @@ def test_progress_is_sent_ten_times_a_second_at_most(started):
 def bad_messages():
     unstamped = cloud()
     unstamped.header.stamp.sec = unstamped.header.stamp.nanosec = 0
-    nan = cloud()
-    nan.data = np.concatenate([np.frombuffer(np.array([np.nan]).tobytes(), np.uint8), nan.data[8:]])
+    infinite = cloud()
+    infinite.data = np.concatenate([np.frombuffer(np.array([np.inf]).tobytes(), np.uint8), infinite.data[8:]])
     result = RESULT.read_text(encoding='utf-8')
     colour = result.replace('"flexibility"', '"colour"')
     return [
-        ('chain', nan, 'chain stamped 60 s: got NaN or infinity'),
-        ('goal_chain', nan, 'goal_chain stamped 60 s: got NaN or infinity'),
+        ('chain', infinite, 'chain stamped 60 s: got infinity'),
+        ('goal_chain', infinite, 'goal_chain stamped 60 s: got infinity'),
         ('goal_chain', unstamped, 'goal_chain stamped 0 s: got a stamp of zero'),
         ('dlo_description', description('no XML'), 'dlo_description, line 1'),
         ('dlo_description', description(colour), 'dlo_description, line'),
