@@ -30,6 +30,7 @@ from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.search import SEARCHES
 
 
@@ -65,6 +66,7 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
     begun, choice = clock(), choose(trials, options or Options())
     options = choice.options
     notices: list[str] = []
+    doubts = implausible_trials(trials, options.table_height if options.table else None, bool(options.scene))
 
     def notice(text: str) -> None:
         notices.append(text)
@@ -85,7 +87,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         result = with_missing_parameters(setting, result)
         result = confirmed(result, options, make_simulator, should_stop, memory, ahead)
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
-    return replace(result, choice=choice, warnings=(*result.warnings, *noticed), seconds=clock() - begun)
+    return replace(result, choice=choice, doubts=doubts, warnings=(*doubts, *result.warnings, *noticed),
+                   seconds=clock() - begun)
 
 
 def fitted(setting: Setting) -> CalibrationResult:

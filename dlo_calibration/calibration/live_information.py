@@ -36,6 +36,7 @@ from dlo_calibration.inference.trial_information import (
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible
 from dlo_calibration.observation.rest_lengths import with_shared_places
 from dlo_calibration.simulation.protocol import Simulator
 
@@ -144,7 +145,10 @@ class LiveInformation:
               closing(ProcessExecutor(1, answer_limit=options.answer_limit)) as process):
             for trial, key in new:
                 fresh = key not in informations
-                if fresh:
+                doubts = implausible(trial, height, bool(options.scene)) if fresh else ()
+                if doubts:  # its information would be about another world
+                    informations[key] = doubts[0]
+                elif fresh:
                     try:
                         informations[key] = _result(job, process.submit(
                             _simulated, trial, known, space, simulator, length, height))

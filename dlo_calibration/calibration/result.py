@@ -18,14 +18,23 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.advice import Advice
-from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.inference.confirmation import Confirmation, DISTANCE_TOLERANCE
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter
-from dlo_calibration.inference.uncertainty import IDENTIFIABLE, INVOLVED, spread_of_best, Uncertainty
+from dlo_calibration.inference.uncertainty import (
+    IDENTIFIABLE,
+    INVOLVED,
+    NOT_IDENTIFIABLE,
+    spread_of_best,
+    Uncertainty,
+)
 from dlo_calibration.model.chain import Floats, frozen_array, put_back
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
+from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import observed, PointErrors
 from dlo_calibration.model.trial import Trial
+
+WORST = 0.1  # of the length; good models of real DLOs are 0.3 to 3 % of it from the measured points
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,7 @@ class CalibrationResult:
     :param missing_parameters: fixed parameters that would explain part of the residuals; empty if noise
         explains the residuals, or if it was not computed.
     :param choice: the options with what was decided from the trials; None: nothing was calibrated.
+    :param doubts: what cannot be right about the trials, see `plausibility`; they are warnings, too.
     """
 
     space: ParameterSpace
@@ -85,6 +95,7 @@ class CalibrationResult:
     advice: Advice | None = None
     missing_parameters: tuple[MissingParameter, ...] = ()
     choice: Choice | None = None
+    doubts: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:
@@ -100,6 +111,38 @@ class CalibrationResult:
             chains=simulated_chains(trials, best), evaluations=found.evaluations, seconds=0.0,
             search=found.search, engine=setting.simulator.name, stop_reason=found.stop_reason,
             seed=setting.options.seed, warnings=_warnings(best, found.evaluations), examination=examination)
+
+    @property
+    def usable(self) -> str:
+        """
+        Why the parameters should not be used, in one sentence; '' if they can be.
+
+        The reasons, the first of which counts: a trial cannot be what it is said to be; the fit is far worse
+        than a model of a DLO is, or not better than the default parameters though noise does not explain it;
+        two engines differ by more than the fit from the measurement; the search was stopped or ended before a
+        minimum; the trials determine no parameter.
+        """
+        mean, found, other = self.errors.mean, self.examination, self.confirmation
+        if self.doubts:
+            return self.doubts[0]
+        if mean > WORST * self.length:
+            return (f'the simulated points are {measured(mean, "m")} from the measured ones on average, '
+                    f'{number(100 * mean / self.length)} % of the length: check frames, grips and clocks')
+        if self.choice is None:
+            return ''  # nothing was fitted
+        if other is not None and other.mean_distance > max(mean, DISTANCE_TOLERANCE):
+            return (f'engine {other.engine} differs from {self.engine} by '
+                    f'{measured(other.mean_distance, "m")}, '
+                    'more than the fit from the measurement: check the trials on which they disagree')
+        if found is None or not found.regular:
+            return (f'the search has not reached a minimum ({self.stop_reason}): calibrate with more '
+                    'evaluations or another search')
+        if mean >= found.default_error and not found.noise_alone:
+            return (f'the default parameters fit as well ({measured(found.default_error, "m")} on average), '
+                    'and noise does not explain what is left: check frames, grips and clocks')
+        if all(one.verdict == NOT_IDENTIFIABLE for one in self.parameters.values()):
+            return 'these trials determine none of the parameters: observe an action that shows one'
+        return ''
 
     @property
     def values(self) -> dict[str, float]:

@@ -45,7 +45,7 @@ def _about(source: Source) -> dict[str, Any]:
         'choice': choice.words,
         'trials': [_about_trial(number, trial)
                    for number, trial in zip(source.numbers, source.trials, strict=True)],
-        'refusals': list(source.refusals), 'problems': list(source.session.problems)}
+        'refusals': list(source.refusals), 'problems': [*source.session.problems, *source.doubts]}
 
 
 def _about_topic(topic: str, kind: str, count: int) -> dict[str, Any]:

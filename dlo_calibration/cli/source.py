@@ -31,6 +31,7 @@ from dlo_calibration.files.session import (
 from dlo_calibration.messages.codec import INPUT_TYPES
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible_trials
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Source:
     :param refusal: why the scene in a file is not among the options; without it, nothing is simulated.
     :param numbers: of the trials, from 1; those that the user leaves out have numbers, too.
     :param selection: the flags that select the same trials in the files of a result.
+    :param doubts: what cannot be right about the trials, see `plausibility`.
     """
 
     session: Session
@@ -52,6 +54,7 @@ class Source:
     refusal: InputError | None = None
     numbers: tuple[int, ...] = ()
     selection: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -130,11 +133,14 @@ def read_source(chosen: argparse.Namespace, note: Callable[[str], None],
         note(text)  # where no trial of a request can be used, `require_trials` says why
     out = left_out(chosen)
     kept = _kept(out, [trial.name for trial in trials], note)
+    used = tuple(trials[number - 1] for number in kept)
+    doubts = implausible_trials(used, options.table_height if options.table else None, bool(options.scene))
+    for text in doubts:
+        note(text)
     selection = ['--without', ','.join(map(str, out))] if out else []
     if chosen.namespace and not session.messages.remapped:
         selection += ['--namespace', chosen.namespace]
-    return Source(session, options, tuple(trials[number - 1] for number in kept), refusals, opened.refusal,
-                  kept, tuple(selection))
+    return Source(session, options, used, refusals, opened.refusal, kept, tuple(selection), doubts)
 
 
 def left_out(chosen: argparse.Namespace) -> tuple[int, ...]:

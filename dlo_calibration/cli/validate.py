@@ -22,6 +22,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.observation.rest_lengths import with_shared_places
 
 TEXT = 'simulate a session with the parameters of a result, without fitting'
@@ -58,10 +59,11 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
         seconds = time.monotonic() - begun
     if evaluation.failure:
         raise SimulationError(evaluation.failure)
-    warnings = tuple(f'never came to rest: {name}; the last state was compared'
-                     for name in evaluation.unsettled)
+    doubts = implausible_trials(trials, options.table_height if options.table else None, bool(options.scene))
+    warnings = (*doubts, *(f'never came to rest: {name}; the last state was compared'
+                           for name in evaluation.unsettled))
     return CalibrationResult(
         space=file.space, parameters=file.parameters, best=evaluation, trials=trials,
         chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
         seconds=seconds, search=file.search, engine=simulator.name,
-        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings)
+        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings, doubts=doubts)

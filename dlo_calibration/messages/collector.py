@@ -49,8 +49,10 @@ from dlo_calibration.messages.manipulations import manipulation_of
 from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
+DOUBTED = (-1, True)  # of a trial whose doubts were told
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
@@ -78,6 +80,7 @@ class TrialCollector:
         self._spare = 0
         self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
         self._news: list[InputError] = []
+        self._doubts: list[str] = []
 
     def with_options(self, options: Options) -> TrialCollector:
         """Return a collector with the same messages, including refused ones, and other options."""
@@ -119,6 +122,7 @@ class TrialCollector:
             self._forget(KEPT // 2)
         if error is not None:
             raise error
+        self._doubt(self._place(key))
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -179,6 +183,29 @@ class TrialCollector:
         """Return, once, the refusals of waiting messages since the last call."""
         news, self._news = self._news, []
         return tuple(news)
+
+    def take_doubts(self) -> tuple[str, ...]:
+        """Return, once, what was found implausible about trials since the last call."""
+        doubts, self._doubts = self._doubts, []
+        return tuple(doubts)
+
+    def _doubt(self, k: int) -> None:
+        """Look whether a builder's trial is plausible, each time that its goals are twice as many."""
+        builder = self._builders[k] if k < len(self._builders) else None
+        if builder is None or not builder.complete or builder.judged == DOUBTED:
+            return
+        judged = len(builder.views).bit_length(), builder.judged[1] or builder.views[-1].stable
+        if judged == builder.judged:
+            return
+        builder.judged = judged
+        complete = [other for other in self._builders[:k + 1] if other.complete]
+        before = complete[-2].trial if len(complete) > 1 else None
+        trial, options = builder.build(f'trial {len(complete)}'), self._options
+        height = options.table_height if options.table else None
+        found = implausible(trial, height, bool(options.scene), before)
+        if found:
+            builder.judged = DOUBTED
+            self._doubts += found
 
     def _check(self, message: Message, key: Key) -> None:
         """Refuse a message that can never be used; forget the refused message that it replaces."""

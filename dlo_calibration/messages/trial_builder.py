@@ -73,6 +73,7 @@ class TrialBuilder:
     waiting: list[Message] = field(default_factory=list)
     refused: list[tuple[Message, InputError]] = field(default_factory=list)
     trial: Trial | None = None
+    judged: tuple[int, bool] = (0, False)  # see `TrialCollector`
 
     @property
     def busy(self) -> bool:

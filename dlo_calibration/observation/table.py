@@ -27,17 +27,17 @@ def resting_level(trial: Trial, table_height: float) -> float | None:
     """
     chains: list[Chain] = [trial.initial] if trial.velocity is None else []
     chains += [goal.chain for goal in trial.goals if goal.stable]
-    level = min((_lowest_level(chain) for chain in chains), default=np.inf)
+    level = min((lowest_level(chain) for chain in chains), default=np.inf)
     return level if level - table_height < HANGING else None
 
 
 def lying_level(chain: Chain, table_height: float) -> float | None:
     """Return the height [m] at which one chain lies on the table, as `resting_level`; None if it hangs."""
-    level = _lowest_level(chain)
+    level = lowest_level(chain)
     return level if level - table_height < HANGING else None
 
 
-def _lowest_level(chain: Chain) -> float:
+def lowest_level(chain: Chain) -> float:
     """Return the median height [m] of the lowest points of a chain; infinity if there are too few of them."""
     z = chain.points[chain.seen, 2]
     lowest = z[z < z.min() + RESTING_BAND]

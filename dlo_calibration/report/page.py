@@ -28,7 +28,7 @@ from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_pan
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
 from dlo_calibration.report.rows import parameter_rows
-from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences
+from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences, verdict
 from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.writing import whole
 
@@ -101,6 +101,7 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
     values = plain(result)
     page = environment.get_template('page.html').render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
+        verdict=verdict(result),
         rows=parameter_rows(values['parameters'], result.space),
         correlated=most_correlated(values['correlations']),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style

@@ -20,6 +20,11 @@ MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
 MOST_COMBINATIONS = 3  # of parameters that the trials do not determine are told
 
 
+def verdict(result: CalibrationResult) -> str:
+    """Return the first sentence that a user should read: whether the parameters can be used, or why not."""
+    return f'Do not use this result: {result.usable}.' if result.usable else 'This result is usable.'
+
+
 def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
     return [*_known(result), *rest_shape_sentences(result), *friction_sentences(result),

@@ -193,11 +193,12 @@ def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
 def print_result(result: CalibrationResult, stream: TextIO,
                  how: Mapping[str, Any] = MappingProxyType({})) -> None:
     """
-    Print which parameters were chosen, tables of the parameters and of the fit, and the sentences.
+    Print whether the result is usable, what was chosen, tables of parameters and fit, and the sentences.
 
     :param how: plain values that replace those of the result.
     """
     out, values = console(stream), {**plain(result), **how}
+    out.print(escape(sentences.verdict(result)))
     if values['choice']:
         out.print(escape(values['choice']))
     out.print(parameter_table(values['parameters'], result.space))

@@ -31,6 +31,7 @@ from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.report import sentences
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.graph import decoded, Graph, why
 from dlo_calibration.ros.outlet import Outlet
@@ -185,7 +186,7 @@ class CalibrationSession:
             self._order.check(message)
             self._order.add(message)
             self._collector.add(message)
-            for refusal in self._collector.take_news():
+            for refusal in (*self._collector.take_news(), *self._collector.take_doubts()):
                 self.refuse(str(refusal))
         except Exception as error:
             return why(error, message.kind)
@@ -308,13 +309,14 @@ class CalibrationSession:
             self.fail(event.text, f'calibration failed: {event.text}', *filter(None, [event.details]))
             return
         situation, options = self._situation, calibration.options
-        situation.state, situation.detail = 'done', event.stop_reason
+        situation.state, situation.detail = 'done', f'{sentences.verdict(event)} {event.stop_reason}'
         calibration.situation.result = event
         if situation is not calibration.situation:
             situation.detail += '; this is the result of the session before the clock went back'
         found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
                           f'{measured(one.physical_value, one.physical_unit)}'
                           for name, one in event.parameters.items())
+        (self._graph.warn if event.usable else self._graph.info)(sentences.verdict(event))
         self._graph.info(f'calibrated: {found}; score {event.best.score:.1f}, mean error '
                          f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
         for warning in event.warnings:

@@ -11,8 +11,10 @@ from toy_simulator import new_toy
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.inference.confirmation import Confirmation
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.report.sentences import sentences
+from dlo_calibration.model.score import PointErrors
+from dlo_calibration.report.sentences import sentences, verdict
 
 
 @pytest.fixture(scope='module')
@@ -41,6 +43,40 @@ def test_what_is_known_well_comes_first_and_what_is_not_is_no_value(result):
     assert 'only roughly' in told[2]
     assert told[3] == ('flexibility could not be determined: with these trials, bending stiffness EI may be '
                        'anything from 0.001 to 0.01 N m^2.')
+
+
+def with_error(found, metres):
+    """Return a result whose points are so far from the measured ones."""
+    return replace(found, best=replace(found.best, errors=PointErrors(metres, metres, metres, metres)))
+
+
+def test_good_result_is_usable(result):
+    assert result.usable == ''
+    assert verdict(result) == 'This result is usable.'
+    stopped = 'budget of 20 evaluations spent'
+    assert replace(result, stop_reason=stopped).usable == ''
+
+
+def test_result_that_should_not_be_used_says_why(result):
+    found = result.examination
+    implausible = replace(result, doubts=('trial 1: got a DLO in the air',))
+    assert verdict(implausible) == 'Do not use this result: trial 1: got a DLO in the air.'
+    assert '51.7 % of the length: check frames' in with_error(result, 0.517 * result.length).usable
+    apart = Confirmation('bullet', 1.0, (1.0, 1.0), result.errors, 0.02, 0.1)
+    assert 'engine bullet differs from toy by 20 mm' in replace(result, confirmation=apart).usable
+    near = replace(apart, mean_distance=0.0003)
+    assert replace(result, confirmation=near).usable == ''
+    early = replace(result, examination=None, stop_reason='stopped on request')
+    assert 'not reached a minimum (stopped on request)' in early.usable
+    assert 'not reached a minimum' in replace(result, examination=replace(found, regular=False)).usable
+    spread = replace(found.uncertainty, residual=0.01)
+    poor = replace(found, default_error=0.01, uncertainty=spread, noise=1e-4)
+    assert 'the default parameters fit as well' in with_error(replace(result, examination=poor), 0.02).usable
+    assert with_error(replace(result, examination=replace(poor, noise=0.01)), 0.02).usable == ''
+    blind = {name: replace(one, verdict=NOT_IDENTIFIABLE) for name, one in result.parameters.items()}
+    assert 'determine none of the parameters' in replace(result, parameters=blind).usable
+    one = {**blind, 'friction': result.parameters['friction']}
+    assert replace(result, parameters=one).usable == ''
 
 
 def test_stiffness_per_weight_is_explained():

@@ -70,13 +70,20 @@ def test_result_tells_the_whole(types):
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent', 'choice': '',
-        'warnings': 'one; two', 'undetermined': '', 'cross_validated_error_mm': '', 'default_error_mm': '',
+        'usable': '', 'warnings': 'one; two', 'undetermined': '',
+        'cross_validated_error_mm': '', 'default_error_mm': '',
         'noise_mm': '', 'residual_std_mm': ''}
     assert one.level == types.level(1)
     clean = found_result(warnings=(), seed=None)
     one, values = by_name(diagnostics.result(types, clean, STAMP))['calibration']
     assert one.level == types.level(0)
+    assert one.message.startswith('This result is usable. Score 30.4')
     assert (values['seed'], values['warnings']) == ('', '')
+    poor = found_result(warnings=(), doubts=('trial 1: got a DLO in the air',))
+    one, values = by_name(diagnostics.result(types, poor, STAMP))['calibration']
+    assert one.level == types.level(1)
+    assert one.message.startswith('Do not use this result: trial 1: got a DLO in the air. Score')
+    assert values['usable'] == 'trial 1: got a DLO in the air'
 
 
 def test_progress_tells_the_best_so_far_and_what_is_left(types):

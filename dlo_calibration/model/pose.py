@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pose: position and orientation of one frame in another, and what it does to points and quaternions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.action import far_from_unit, quaternion_lengths
+from dlo_calibration.model.chain import check_size, Floats, frozen_array
+
+NUMBERS = 'x y z qx qy qz qw'
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """
+    The pose of a frame in another one.
+
+    :param position: (3,) [m] of its origin.
+    :param orientation: (4,) unit quaternion x y z w.
+    """
+
+    position: Floats
+    orientation: Floats
+
+    def __post_init__(self) -> None:
+        position, orientation = frozen_array(self.position), np.array(self.orientation, dtype=float)
+        check_size('pose', 'position', position[None, :])
+        length = quaternion_lengths(orientation)
+        if not (np.isfinite(position).all() and np.isfinite(length)) or bool(far_from_unit(length)):
+            raise InputError('pose', ' '.join(f'{one:g}' for one in (*position, *orientation)),
+                             f'finite numbers {NUMBERS} with a unit quaternion', 'correct it')
+        object.__setattr__(self, 'position', position)
+        object.__setattr__(self, 'orientation', frozen_array(orientation / length))
+
+    @classmethod
+    def of(cls, text: str) -> Self | None:
+        """Return the pose that seven numbers give, in metres; None where the text is not seven numbers."""
+        try:
+            numbers = [float(word) for word in text.replace(',', ' ').split()]
+        except ValueError:
+            return None
+        return cls(np.array(numbers[:3]), np.array(numbers[3:])) if len(numbers) == 7 else None
+
+    def __str__(self) -> str:
+        return ' '.join(repr(one) for one in (*self.position.tolist(), *self.orientation.tolist()))
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(3, 3) rotation matrix."""
+        x, y, z, w = self.orientation
+        return frozen_array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+    @property
+    def inverse(self) -> Pose:
+        """The pose of the other frame in this one."""
+        return Pose(-self.position @ self.rotation, self.orientation * [-1.0, -1.0, -1.0, 1.0])
+
+    def points(self, points: Floats) -> Floats:
+        """Return (..., 3) points of the frame in the other one [m]."""
+        return np.asarray(points @ self.rotation.T + self.position)
+
+    def vectors(self, vectors: Floats) -> Floats:
+        """Return (..., 3) vectors of the frame, such as velocities, in the other one."""
+        return np.asarray(vectors @ self.rotation.T)
+
+    def orientations(self, orientations: Floats) -> Floats:
+        """Return (..., 4) quaternions x y z w of the frame in the other one."""
+        (x, y, z, w), (i, j, k, r) = self.orientation, np.moveaxis(orientations, -1, 0)
+        return np.stack([w * i + x * r + y * k - z * j, w * j - x * k + y * r + z * i,
+                         w * k + x * j - y * i + z * r, w * r - x * i - y * j - z * k], axis=-1)

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A trial in a wrong frame, unit or order of points is told, with the remedy; a good one never is."""
+
+from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from resting import trial_of
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.files.request import read_request, request_trials
+from dlo_calibration.files.session import read_session
+from dlo_calibration.messages.codec import ActionMessage
+from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.messages.encoder import trial_messages
+from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.pose import Pose
+from dlo_calibration.observation import implausible, implausible_trials
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLES = ROOT / 'msg_samples'
+DATA = Path(os.environ.get('DLO_DATA', ROOT / '../shared/data'))
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+QUARTER = np.sqrt(0.5)
+
+
+@pytest.fixture(scope='module')
+def lying():
+    """Give the trials of the first sample, whose DLO lies on a table at 0 m."""
+    return read_session(SAMPLES / 'object1').trials
+
+
+def moved(trial, position=(0.0, 0.0, 0.0), orientation=LEVEL, scale=1.0):
+    """Return a trial as seen from a frame with another pose or unit."""
+    pose = Pose(position, orientation)
+
+    def chain(one):
+        return replace(one, points=scale * pose.points(one.points))
+
+    hands = [tuple(Hand(hand.name, hand.grips, hand.times, scale * pose.points(hand.positions),
+                        pose.orientations(hand.orientations)) for hand in action.hands)
+             for action in trial.actions]
+    return replace(trial, initial=chain(trial.initial), actions=tuple(map(Action, hands)),
+                   goals=tuple(replace(goal, chain=chain(goal.chain)) for goal in trial.goals))
+
+
+def turned(chain):
+    return replace(chain, points=chain.points[::-1])
+
+
+@pytest.mark.parametrize('name', [f'object{k}' for k in range(1, 6)])
+def test_nothing_is_wrong_with_a_sample_session(name):
+    session = read_session(SAMPLES / name)
+    assert len(session.trials) == 4
+    assert implausible_trials(session.trials, 0.0) == ()
+
+
+@pytest.mark.parametrize('name', ['push_and_release', 'hand_paths', 'named_actions'])
+def test_nothing_is_wrong_with_a_sample_request(name):
+    request = read_request(SAMPLES / 'xml' / f'{name}.xml')
+    trials, _ = request_trials(request, Options.of(request.options))
+    assert trials
+    assert implausible_trials(trials, 0.0) == ()
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'position': (0, 0, 0.75)}, ('754 mm above the table', 'table_height to about 0.754', 'frame_pose')),
+    ({'position': (0, 0, 0.06)}, ('64.4 mm above the table', 'table_height to about 0.0644')),
+    ({'position': (0, 0, -0.75)}, ('746 mm below the table', 'table_height to about -0.746')),
+    ({'orientation': (-QUARTER, 0, 0, QUARTER)}, ('90 degrees from level', 'z is up', 'frame_pose')),
+    ({'orientation': (0, QUARTER, 0, QUARTER)}, ('90 degrees from level', 'frame_pose')),
+    ({'position': (0, 0, 0.8), 'orientation': (0.97, 0, 0, 0.26)}, ('degrees from level', 'frame_pose')),
+    ({'scale': 1000.0}, ('601.5 m long', 'millimetres (0.601 m then)')),
+    ({'scale': 1 / 0.0254}, ('23.', 'inches (0.601 m then)')),
+], ids=['above', 'near above', 'below', 'y up', 'x up', 'camera', 'millimetres', 'inches'])
+def test_wrong_frame_or_unit_is_told_with_its_remedy(lying, change, words):
+    text, = implausible(moved(lying[0], **change), 0.0)
+    assert text.startswith('trial 1: got a DLO ')
+    for word in words:
+        assert word in text
+
+
+def test_the_same_frame_is_right_where_the_table_is_said_to_be_there(lying):
+    assert implausible_trials([moved(trial, (3.0, -2.0, 0.75)) for trial in lying], 0.75) == ()
+
+
+def test_a_dlo_that_nothing_holds_needs_a_table_or_an_obstacle(lying):
+    text, = implausible(lying[0], None)
+    assert 'nothing holds' in text
+    assert 'set table to true and table_height to 0.00' in text
+    assert implausible(moved(lying[0], (0, 0, 0.75)), 0.0, scene=True) == ()
+
+
+def test_points_that_run_from_the_other_end_are_told(lying):
+    first, second = lying[:2]
+    swapped = replace(first, goals=(replace(first.goals[0], chain=turned(first.goals[0].chain)),))
+    text, = implausible(swapped, 0.0)
+    assert 'a goal chain at 2.25 s whose points run from the other end' in text
+    again = replace(second, initial=first.goals[-1].chain)
+    assert implausible(again, 0.0, before=first) == ()
+    text, = implausible(replace(second, initial=turned(first.goals[-1].chain)), 0.0, before=first)
+    assert 'the last one of trial 1 from the other end' in text
+
+
+def hanging(away):
+    """Return a trial whose DLO hangs on one pin, away from the vertical by an angle [rad]."""
+    along = np.linspace(0.0, 0.5, 11)[:, None]
+    points = along * [np.sin(away), 0.0, -np.cos(away)] + [0.0, 0.0, 0.8]
+    return trial_of(points, [(0,)], initial=points)
+
+
+def test_a_dlo_on_a_pin_hangs_straight_below_it():
+    assert implausible(hanging(0.3), 0.0) == ()
+    assert implausible(hanging(0.3), None) == ()
+    text, = implausible(hanging(np.pi / 2), None)
+    assert '90 degrees from straight below the hands' in text
+    text, = implausible(hanging(np.pi), None)
+    assert '180 degrees' in text
+
+
+def test_the_collector_tells_it_once_when_the_trial_is_complete(lying):
+    collector = TrialCollector(Options())
+    told = []
+    for message in trial_messages(tuple(moved(trial, (0, 0, 0.75)) for trial in lying[:2]), 'camera'):
+        collector.add(message)
+        told += [(type(message) is ActionMessage, text) for text in collector.take_doubts()]
+    assert [text.split(':')[0] for _, text in told] == ['trial 1', 'trial 2']
+    assert collector.take_doubts() == ()
+    assert collector.count == 2
+    right = collector.with_options(Options(table_height=0.75))
+    assert right.take_doubts() == ()
+
+
+@pytest.mark.parametrize('source', [('reference', 'object2'), ('mocap', 'dlo3', '--recordings', '0'),
+                                    ('hanging', 'white', '--repeats', '0')], ids=lambda source: source[0])
+def test_nothing_is_wrong_with_measured_sessions(tmp_path, source):
+    if not DATA.is_dir():
+        pytest.skip(f'{DATA} is not there; DLO_DATA names the folder of measured data')
+    place = spec_from_file_location('convert', ROOT / 'benchmark' / 'convert.py')
+    convert = module_from_spec(place)
+    place.loader.exec_module(convert)
+    kind, name, *rest = source
+    assert convert.main(['--data', str(DATA), kind, name, str(tmp_path / 'out'), *rest]) == 0
+    session = read_session(tmp_path / 'out')
+    assert session.trials
+    assert implausible_trials(session.trials, 0.0 if session.options.table else None) == ()
