@@ -26,12 +26,16 @@ EXECUTABLES = ('calibrator', 'dlo-calibration')
 ROSDEP_KEYS = {
     'PIL': 'python3-pil',
     'cv2': 'python3-opencv',
-    'lz4': 'mcap-ros2-support',  # by way of mcap, which needs it
-    'mcap': 'mcap-ros2-support',
-    'pybullet': 'python3-pybullet-pip',
-    'rosbags': 'python3-rosbags-pip',
     'ruamel': 'python3-ruamel.yaml',
-    'zstandard': 'mcap-ros2-support',
+}
+
+#: Import name of a Python library without a Debian package -> what brings it, of requirements.txt.
+FROM_PIP = {
+    'lz4': 'mcap',
+    'mcap': 'mcap',
+    'pybullet': 'pybullet',
+    'rosbags': 'rosbags',
+    'zstandard': 'mcap',
 }
 
 #: Imported only by what a user chooses, with words that tell what to install where it is missing.
@@ -79,12 +83,34 @@ def test_what_is_imported_is_declared():
     # A ROS package has the name of its module, and is not for setup.py.
     names = set(third_party_imports()) - keys
     not_in_manifest = {name for name in names - OPTIONAL
-                       if ROSDEP_KEYS.get(name, f'python3-{name}') not in keys}
+                       if ROSDEP_KEYS.get(name, f'python3-{name}') not in keys
+                       and FROM_PIP.get(name) not in from_pip()}
     not_in_setup = {name for name in names if not any(f"'{one}>=" in requirements
                                                       for one in distributions.get(name, [name]))}
     assert names
-    assert not_in_manifest == set(), 'add them to package.xml'
+    assert not_in_manifest == set(), 'add them to package.xml or requirements.txt'
     assert not_in_setup == set(), 'add them to setup.py'
+
+
+def from_pip():
+    """Return what requirements.txt names: name -> lower bound."""
+    text = (ROOT / 'requirements.txt').read_text(encoding='utf-8')
+    return dict(re.findall(r'^([\w-]+)>=([\d.]+)$', text, re.MULTILINE))
+
+
+def test_requirements_are_those_of_setup():
+    requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    assert from_pip()
+    for name, bound in from_pip().items():
+        assert f"'{name}>={bound}'" in requirements
+
+
+def test_bloom_takes_every_key():
+    """It takes those that rosdep resolves to Debian packages; keys for pip end with -pip, but for a few."""
+    for element in manifest().iter():
+        if str(element.tag).endswith('depend'):
+            assert not element.text.endswith('-pip')
+            assert element.text != 'mcap-ros2-support'
 
 
 def test_colcon_puts_executables_where_ros2_run_looks(prefix):

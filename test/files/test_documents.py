@@ -3,18 +3,15 @@
 
 """The documents say what is declared."""
 
-from dataclasses import replace
 from pathlib import Path
 import re
 
 from made_up_plan import made_up_plan
-import numpy as np
 import pytest
 
 from dlo_calibration.calibration.options import declarations
-from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.files.result import read_result, write_result
+from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.planning.plain import plain_plan
 from dlo_calibration.ros import planner_diagnostics, planner_session
@@ -83,50 +80,3 @@ def test_links_lead_somewhere(document):
     for target in re.findall(r'\]\(([^)#]+)\)', text):
         if '://' not in target:
             assert ((ROOT / document).parent / target).exists(), target
-
-
-def test_the_snippets_of_the_readme_work(tmp_path, capsys):
-    """Execute them one after the other, on a sample and with fewer evaluations."""
-    import pybullet
-
-    text = (ROOT / 'README.md').read_text(encoding='utf-8')
-    sample, few = str(ROOT / 'msg_samples/object1'), "evaluations=2, nodes=12, workers=1, engine='compiled'"
-    for written, tried in (('dlo_session_20260101_120000', sample), ('another_session', sample),
-                           ('mass=0.03', f'mass=0.03, {few}'),
-                           ('session.options)', f'replace(session.options, {few}))'),
-                           ('fitted/result.xml', str(tmp_path / 'result.xml'))):
-        assert written in text
-        text = text.replace(written, tried)
-    one, several, world = re.findall('```python\n(.*?)```', text, re.DOTALL)
-    names = {'replace': replace}
-    exec(one, names)
-    assert capsys.readouterr().out.count('flexibility') == 1
-    exec(several, names)
-    assert len(names['result'].trials) == 2 * len(names['session'].trials)
-    write_result(tmp_path / 'result.xml', names['result'])
-    client = pybullet.connect(pybullet.DIRECT)
-    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-    points = names['session'].trials[0].initial.points + (0, 0, 1)
-    names.update(client=client, points=points)
-    exec(world, names)
-    pybullet.disconnect(physicsClientId=client)
-    # There is no table in this world: one step of free fall.
-    rope = names['rope']
-    expected = points[:, 2].mean() - 9.81 * rope.time_step**2
-    assert rope.points[:, 2].mean() == pytest.approx(expected, abs=3e-4)
-
-
-def test_the_snippet_about_planning_works(capsys):
-    """Execute it on a sample, with a shorter search."""
-    text = (ROOT / 'doc/planning.md').read_text(encoding='utf-8')
-    for written, tried in (("'result.xml'", repr(str(ROOT / 'msg_samples/xml/dlo.xml'))),
-                           ('actions=3', 'actions=1, draws=0, workers=1')):
-        assert written in text
-        text = text.replace(written, tried)
-    snippet, = re.findall('```python\n(.*?)```', text, re.DOTALL)
-    names = {name: read_chain_file(ROOT / f'msg_samples/chains/{name}.csv').points
-             for name in ('start', 'goal')}
-    exec(snippet, names)
-    assert capsys.readouterr().out.startswith('False')  # one action is not enough
-    planned, = names['planned'].actions
-    np.testing.assert_allclose(names['prediction'].steps[-1].chain, planned.predicted, atol=1e-3)
