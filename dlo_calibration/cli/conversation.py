@@ -110,7 +110,8 @@ def _robot(child: subprocess.Popen[bytes], log: Path, stop: Callable[[], bool]) 
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise DloCalibrationError(
-            f"{error}; source a ROS 2 Jazzy installation, or pip install 'dlo_calibration[ros]'") from error
+            f"{error}; source a ROS 2 Jazzy installation, or, in the folder of dlo_calibration, install "
+            "the libraries: pip install '.[ros]'") from error
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node('robot')

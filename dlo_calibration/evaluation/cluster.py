@@ -42,7 +42,7 @@ class ClusterExecutor(Executor):
         except ImportError as error:
             raise InputError(
                 'parameter scheduler', f'{address!r} without the library distributed ({error})',
-                'that library', "install it with pip install 'dlo_calibration[distributed]'") from error
+                'that library', 'install it: pip install distributed') from error
         self._address = address
         self._on_loss = on_loss
         self._closed = threading.Event()

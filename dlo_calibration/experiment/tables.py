@@ -31,10 +31,23 @@ from dlo_calibration.report.figure import (
     YELLOW,
 )
 
-UNKNOWN = 'not known to us'  # for figures of the paper
-#: The paper's validity [cm], by the sample that resembles its object, and its consistency (0..100).
-PAPER_VALIDITY: Mapping[str, float] = {'object5': 53.0}
-PAPER_SCATTER = (10.0, 28.0)
+#: Tables 1 and 2 of the paper (Alvarez, Yamazaki and Matsubara, SIMPAR 2016), by the sample that resembles
+#: the object: average and standard deviation over 20 runs of each parameter (0..100), and of the score [cm].
+PAPER_CONSISTENCY: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    'object1': {'flexibility': (68.75, 17.38), 'elasticity': (49.55, 13.88), 'friction': (33.85, 20.02),
+                'self_collision': (52.35, 20.01)},
+    'object2': {'flexibility': (65.15, 19.02), 'elasticity': (20.45, 13.94), 'friction': (53.65, 27.48),
+                'self_collision': (38.3, 16.41)},
+    'object3': {'flexibility': (75.45, 18.65), 'elasticity': (31.25, 10.82), 'friction': (37.75, 27.91),
+                'self_collision': (57.8, 22.87)},
+    'object4': {'flexibility': (43.8, 18.65), 'elasticity': (88.55, 1.5), 'friction': (48.05, 26.82),
+                'self_collision': (37.35, 23.06)},
+    'object5': {'flexibility': (48.35, 17.89), 'elasticity': (28.85, 20.09), 'friction': (52.15, 22.82),
+                'self_collision': (88.35, 14.98)},
+}
+PAPER_VALIDITY: Mapping[str, tuple[float, float]] = {
+    'object1': (24.96, 1.33), 'object2': (23.9, 2.73), 'object3': (24.34, 0.62), 'object4': (32.25, 3.46),
+    'object5': (53.39, 1.12)}
 COLOURS = (BLUE, YELLOW, GREEN, PURPLE)  # of searches, in turn
 
 
@@ -68,10 +81,10 @@ class Account:
 
 def document(account: Account) -> dict[str, Any]:
     """Return the account as plain values."""
-    paper = {'validity': dict(PAPER_VALIDITY), 'scatter': list(PAPER_SCATTER)} if account.samples else None
+    paper = {'consistency': PAPER_CONSISTENCY, 'validity': PAPER_VALIDITY} if account.samples else None
     return {'command': account.command, 'engine': account.engine, 'runs': account.runs,
             'evaluations': account.evaluations, 'complete': account.complete,
-            'paper': paper, 'findings': known([asdict(one) for one in account.findings])}
+            'paper': known(paper), 'findings': known([asdict(one) for one in account.findings])}
 
 
 def markdown(account: Account) -> str:
@@ -89,10 +102,11 @@ def markdown(account: Account) -> str:
     if any(name in knot_names(KNOTS[-1]) for one in account.findings for name in one.parameters):
         parts.append('The components of rest shapes are in `consistency.csv`.')
     if account.samples:
-        parts.append(f'In the paper, parameters scatter by {PAPER_SCATTER[0]:g} to {PAPER_SCATTER[1]:g} '
-                     f'over the runs; its figures for each object are {UNKNOWN}.')
+        parts.append('The paper has figures of the objects that the samples resemble.  Its scales are those '
+                     'of its own simulator: compare the standard deviations, but not the averages.')
     for search in account.searches:
-        parts += [f'### {search}', _consistency([one for one in account.findings if one.search == search])]
+        parts += [f'### {search}', _consistency([one for one in account.findings if one.search == search],
+                                                 PAPER_CONSISTENCY if account.samples else {})]
     parts += ['## Validity', 'Average and standard deviation, over the runs, of the difference score of '
               'actions that were not calibrated on, and of their point error.  '
               f'A score below {SIMILAR:g} is similar, and below {VERY_SIMILAR:g} very similar (**bold**).  '
@@ -177,7 +191,8 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
     write_figure(figure, path)
 
 
-def _consistency(findings: Sequence[Findings]) -> str:
+def _consistency(findings: Sequence[Findings],
+                 paper: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
     names = _in_tables(name for one in findings for name in one.parameters)
     rows: list[list[str]] = []
     for one in findings:
@@ -193,6 +208,11 @@ def _consistency(findings: Sequence[Findings]) -> str:
             average.append(mean)
             deviation.append(std)
         rows += [average, deviation]
+        theirs = paper.get(one.subject)
+        if theirs:
+            rows += [['', f'{word} in the paper', *(
+                f'{theirs[name][k]:g}' if name in theirs else '-' for name in names)]
+                for k, word in enumerate(('average', 'standard deviation'))]
     return _table(('object', '', *names), rows)
 
 
@@ -217,7 +237,8 @@ def _validity(account: Account) -> str:
     if account.samples:
         head.append('score in the paper')
         for row in rows:
-            row.append(f'{PAPER_VALIDITY[row[0]]:g}' if row[0] in PAPER_VALIDITY else UNKNOWN)
+            theirs = PAPER_VALIDITY.get(row[0])
+            row.append(f'{theirs[0]:g} ± {theirs[1]:g}' if theirs else '-')
     if any(one.failures for one in account.findings):
         head.append('failed')
         for row, one in zip(rows, account.findings, strict=True):

@@ -82,9 +82,12 @@ def test_the_papers_figures_stand_beside_the_samples_only():
     fifth = replace(FINDINGS, subject='object5')
     account = replace(ACCOUNT, findings=(replace(FINDINGS, subject='object1'), fifth), samples=True)
     text = markdown(account)
-    assert cells(text, 'object5')[1][-1] == '53'
-    assert cells(text, 'object1')[1][-1] == 'not known to us'
-    assert document(account)['paper']['validity'] == {'object5': 53.0}
+    assert cells(text, 'object5')[1][-1] == '53.39 ± 1.12'
+    assert cells(text, 'object1')[1][-1] == '24.96 ± 1.33'
+    assert cells(text, '')[:3] == [
+        ['', 'standard deviation', '10', '*0*'], ['', 'average in the paper', '33.85', '49.55'],
+        ['', 'standard deviation in the paper', '20.02', '13.88']]
+    assert document(account)['paper']['consistency']['object4']['elasticity'] == [88.55, 1.5]
     text = markdown(replace(account, samples=False))
     assert 'paper' not in text
     assert document(replace(account, samples=False))['paper'] is None
