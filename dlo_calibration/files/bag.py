@@ -56,6 +56,7 @@ class Bag:
         self.path = path
         self.intake = Intake(remap)
         self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
+        self.taken_back: list[str] = []  # marks of trials that the last calibration did without; see `used`
         self._options: str | None = None  # the last recorded ones
         self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
 
@@ -94,6 +95,7 @@ class Bag:
         first = max((place for mark, place in self.marks if mark == 'reset' and place <= newest), default=0)
         last = max((place for mark, place in self.marks if mark == 'start' and place > first),
                    default=len(self.records))
+        self.taken_back = [mark for mark, place in self.marks if first <= place < last]
         return [record for record in inputs if first <= places[id(record)] < last]
 
     def read(self) -> None:

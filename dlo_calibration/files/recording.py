@@ -124,10 +124,9 @@ class SessionWriter:
 
     def write_mark(self, mark: str) -> None:
         """
-        Record the start of a calibration, or a reset, which forgets the trials.
+        Record the start of a calibration, a reset, which forgets the trials, or that one was taken back.
 
-        :param mark: ``start`` or ``reset``, the services that decide which
-            messages a result uses.
+        :param mark: ``start``, ``reset``, or `taken_back.mark`: what decides which messages a result uses.
         """
         self._write_metadata_record('mark', mark)
 

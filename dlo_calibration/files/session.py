@@ -23,6 +23,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, InputError, meant, one_of, told
 from dlo_calibration.files.bag import Bag, decode, encode
 from dlo_calibration.files.intake import Record
+from dlo_calibration.files.taken_back import without_taken_back
 from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
@@ -217,7 +218,8 @@ def _collected(messages: Iterable[Message],
             refusals.append((one.kind, str(error)))
         except Exception as error:  # a defect of this package must not cost the other messages
             refusals.append((one.kind, f'{one}: could not be used ({error!r}); {DEFECT}'))
-        refusals += [(one.kind, str(refusal)) for refusal in collector.take_news()]
+        refusals += [(one.kind, str(refusal))
+                     for refusal in (*collector.take_news(), *collector.take_early())]
     return collector, refusals
 
 
@@ -259,7 +261,7 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
     used = source.used(inputs)
-    messages, frames = _checked(used, problems)
+    messages, frames = _checked(without_taken_back(used, source.taken_back, problems), problems)
     problems += source.dropped()
     late = len(inputs) - len(used)
     if late:

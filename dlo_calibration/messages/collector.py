@@ -27,7 +27,8 @@ does not order different topics, and a robot may publish an action only when it 
 A message that does not fit those with earlier stamps is refused, but remembered: it
 is used when a late message with an earlier stamp makes it fit.  Actions and goal
 chains before the first initial chain wait (see `incomplete`).  When an initial chain
-with a later stamp arrives, they are refused together (see `take_news`).  A second
+with a later stamp arrives, they are refused together (see `take_news`, and `take_early` for
+goal chains alone, which a tracker that is on already sends).  A second
 message of the same kind and stamp (and the same hands) is refused, unless the first
 one was refused: then it replaces that one.
 
@@ -44,7 +45,7 @@ from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ActionMessage, INITIAL
+from dlo_calibration.messages.codec import ActionMessage, GOAL, INITIAL
 from dlo_calibration.messages.manipulations import manipulation_of
 from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
 from dlo_calibration.model.manipulation import Manipulation
@@ -81,15 +82,21 @@ class TrialCollector:
         self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
         self._news: list[InputError] = []
         self._doubts: list[str] = []
+        self._early: list[InputError] = []
 
     def with_options(self, options: Options) -> TrialCollector:
         """Return a collector with the same messages, including refused ones, and other options."""
         other = TrialCollector(options)
+        gone = [builder for builder in self._builders if builder.until is not None]
         for key in sorted(self._known):
+            while gone and gone[0].first < key:
+                other._leave_out(gone.pop(0))
             try:
                 other.add(self._known[key])
             except InputError:
                 pass  # it is among `other.problems`
+        for one in gone:
+            other._leave_out(one)
         for begin, end in self._forgotten:
             other._close(begin, end)
         return other
@@ -102,6 +109,10 @@ class TrialCollector:
         """
         key = order(message)
         self._check(message, key)
+        place = self._place(key)
+        until = self._builders[place].until
+        if until is not None and (message.kind != INITIAL or key <= until):
+            return  # it belongs to the trial that was taken back, of which a tracker may send more
         self._frame = message.frame_id
         self._known[key] = message
         self._numbers += _size(message)
@@ -114,15 +125,40 @@ class TrialCollector:
             before = last.spare
             error = last.extend(message, self._options)
             self._spare += last.spare - before
+        elif until is not None:
+            self._builders.insert(place + 1, TrialBuilder(key))
+            error = self._builders[place + 1].extend(message, self._options)
+            self._spare += 1
         else:
             error = self._insert(message, key)
         if without_start and len(self._builders) > 1:
-            self._news += self._orphans()
+            streamed = all(one.kind == GOAL for one in self._builders[0].waiting)
+            (self._early if streamed else self._news).extend(self._orphans())
         if self._spare > KEPT:
             self._forget(KEPT // 2)
         if error is not None:
             raise error
         self._doubt(self._place(key))
+
+    def take_back(self) -> tuple[int, int]:
+        """
+        Forget the messages of the newest trial, also of an incomplete one.
+
+        Initial chains that came since stay; what else comes before the next one is not used.
+
+        :returns: the stamps between which messages are left out [ns].
+        :raises InputError: if there is none.
+        """
+        place = max((k for k, one in enumerate(self._builders) if one.starts and one.busy), default=0)
+        if not place:
+            raise InputError('~/discard_last', 'no trial', 'one', 'there is nothing to take back')
+        builder = self._builders[place]
+        messages = builder.messages()
+        until = order(messages[-1]) if place < len(self._builders) - 1 else self._newest
+        self._drop(messages)
+        self._spare -= builder.spare
+        self._builders[place] = TrialBuilder(builder.first, until)
+        return builder.first[0], until[0]
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -167,7 +203,7 @@ class TrialCollector:
         They include those that later messages caused, but not those that `take_news` returns.
         """
         found = [error for builder in self._builders for _, error in builder.refused]
-        for builder, following in pairwise(self._builders[1:]):
+        for builder, following in pairwise(one for one in self._builders[1:] if one.until is None):
             found += _cut_off(builder, f'and {following.starts[0]}',
                               'send no initial chain before the trial is complete')
         return tuple(found)
@@ -206,6 +242,11 @@ class TrialCollector:
         if found:
             builder.judged = DOUBTED
             self._doubts += found
+
+    def take_early(self) -> tuple[InputError, ...]:
+        """Return, once, why goal chains that came before any action or initial chain are not used."""
+        early, self._early = self._early, []
+        return tuple(early)
 
     def _check(self, message: Message, key: Key) -> None:
         """Refuse a message that can never be used; forget the refused message that it replaces."""
@@ -256,7 +297,7 @@ class TrialCollector:
                 if one is message:
                     found = error
             end += 1
-            more = end < len(self._builders) and not folded[-1].busy
+            more = end < len(self._builders) and not folded[-1].busy and self._builders[end].until is None
             waiting = self._builders[end].messages() if more else []
         self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._builders[begin:end])
         self._builders[begin:end] = folded
@@ -265,7 +306,8 @@ class TrialCollector:
         return found
 
     def _no_start(self, message: Message, more: int = 0) -> InputError:
-        first = f'the first is {self._builders[1].starts[0]}' if len(self._builders) > 1 else 'there is none'
+        started = next((builder for builder in self._builders[1:] if builder.starts), None)
+        first = f'the first is {started.starts[0]}' if started else 'there is none'
         return InputError(
             f'{message} and {more} more' if more else str(message),
             f'no initial_chain before {"them" if more else "it"}', f'one stamped earlier ({first})',
@@ -312,6 +354,12 @@ class TrialCollector:
         count = max(min(surplus - count, len(builder.waiting)), 0)
         self._drop(builder.waiting[:count])
         del builder.waiting[:count]
+
+    def _leave_out(self, builder: TrialBuilder) -> None:
+        """Note that a trial was taken back which is later than all messages so far."""
+        assert builder.until is not None
+        self._builders.append(TrialBuilder(builder.first, builder.until))
+        self._newest = max(self._newest, builder.until)
 
     def _drop(self, messages: Iterable[Message]) -> None:
         for message in messages:

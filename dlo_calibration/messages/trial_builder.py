@@ -62,11 +62,13 @@ class TrialBuilder:
     `extend` takes messages in their order only.
 
     :param first: key of the first initial chain.
+    :param until: key up to which the messages were taken back; it then stays empty. None: they were not.
     :param starts: initial chains; the last one counts, and the one before it for the velocity.
     :param waiting: messages for which an initial chain or an action is still missing.
     """
 
     first: Key
+    until: Key | None = None
     starts: list[ChainMessage] = field(default_factory=list)
     moves: list[Move] = field(default_factory=list)
     views: list[GoalView] = field(default_factory=list)

@@ -64,7 +64,7 @@ class CalibratorNode(GraphNode[Options]):
         self._working = False
         self._more = self.create_guard_condition(self._work)
         self.subscribe(*INPUT_TYPES)
-        for name in ('start', 'stop', 'reset'):
+        for name in ('start', 'stop', 'reset', 'discard_last'):
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         self._jump: TimeJump | None = None  # of the node's clock, back
         # rclpy calls nobody, or crashes, where this is not kept.

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 import time
 from typing import Callable, Mapping, Sequence
@@ -19,10 +20,13 @@ from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.result import write_result
+from dlo_calibration.files.taken_back import mark
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.report.page import Origin, repeating_command
 from dlo_calibration.ros.report_writer import ReportWriter
 from dlo_calibration.writing import Attempts
+
+FILES = (('result', '.xml'), ('evaluations', '.csv'), ('report', '.html'))  # of a result
 
 
 class Recorder:
@@ -79,6 +83,10 @@ class Recorder:
         """Record how many messages of each kind were dropped since the session began."""
         self._write(lambda session: session.write_dropped(counts))
 
+    def taken_back(self, first: int, last: int) -> None:
+        """Record that the messages of a trial, stamped from `first` to `last` [ns], are left out."""
+        self._write(lambda session: session.write_mark(mark(first, last)))
+
     def start(self, trials: Sequence[Trial], options: Options) -> EvaluationLog | None:
         """
         Record that a calibration starts, on the messages recorded so far; return the log of its evaluations.
@@ -124,26 +132,37 @@ class Recorder:
             self._on_failure(f'{error}; this calibration could not go on after an interruption')
         return None
 
-    def result(self, result: CalibrationResult, options: Options) -> None:
+    def result(self, result: CalibrationResult, options: Options) -> str:
         """
-        Write result.xml and evaluations.csv (result_2.xml, ...) into the folder of the calibration's session.
+        Write result.xml and evaluations.csv into the folder of the calibration's session.
 
-        report.html (report_2.html, ...) follows some seconds later.
+        report.html follows some seconds later.  The files of a result before become result_1.xml, ...
+
+        :returns: where these are now, in words; empty if there is none.
         """
-        if self._calibrated is not None:
-            folder = self._calibrated.path
-            suffix, attempts = _free(folder), Attempts(folder)
-            name = f'result{suffix}.xml'
-            with attempts.attempt(name):
-                write_result(folder / name, result, options.flat())
-            name = f'evaluations{suffix}.csv'
-            with attempts.attempt(name):
-                write_evaluations(folder / name, result)
-            self._written = not attempts.failure
-            if attempts.failure:
-                self._miss(folder, attempts.failure)
-            origin = Origin(folder.name, repeating_command(folder.name, options), options)
-            self._reporter.begin(folder / f'report{suffix}.html', result, origin)
+        if self._calibrated is None:
+            return ''
+        folder, older = self._calibrated.path, ''
+        attempts, names = Attempts(folder), [f'{stem}{kind}' for stem, kind in FILES]
+        if any((folder / name).exists() for name in names):
+            number = next(number for number in count(1) if not any(
+                (folder / f'{stem}_{number}{kind}').exists() for stem, kind in FILES))
+            older = f'_{number}'
+            for stem, kind in FILES[:2]:
+                with suppress(OSError):  # it was not written then, or is replaced now
+                    (folder / f'{stem}{kind}').replace(folder / f'{stem}{older}{kind}')
+        with attempts.attempt(names[0]):
+            write_result(folder / names[0], result, options.flat())
+        with attempts.attempt(names[1]):
+            write_evaluations(folder / names[1], result)
+        self._written = not attempts.failure
+        if attempts.failure:
+            self._miss(folder, attempts.failure)
+        origin = Origin(folder.name, repeating_command(folder.name, options), options)
+        self._reporter.begin(folder / names[2], result, origin,
+                             folder / f'report{older}.html' if older else None)
+        return f'{folder / names[0]} is the newest result; the one before is result{older}.xml there' \
+            if older else ''
 
     def tell(self) -> None:
         """Call `on_failure` for each report that could not be written since the last call."""
@@ -196,12 +215,3 @@ def _cause(error: RecordingError) -> str:
     """Return why a session could not be written, in few words."""
     cause = error.__cause__
     return getattr(cause, 'strerror', None) or str(cause or error)
-
-
-def _free(folder: Path) -> str:
-    """Return what distinguishes the names of a result's files from those that are there: ``_2``, ..."""
-    suffix, number = '', 2
-    while any((folder / f'{stem}{suffix}{kind}').exists() for stem, kind in (
-            ('result', '.xml'), ('evaluations', '.csv'), ('report', '.html'))):
-        suffix, number = f'_{number}', number + 1
-    return suffix

@@ -32,10 +32,16 @@ class ReportWriter:
         self._stop = threading.Event()
         self._threads: dict[threading.Thread, Path] = {}
 
-    def begin(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
-        """Begin to write a page; returns at once."""
+    def begin(self, path: Path, result: CalibrationResult, origin: Origin, older: Path | None = None) -> None:
+        """
+        Begin to write a page; returns at once.
+
+        :param older: where a page that has this path goes before, also one that is still being written.
+        """
         self._threads = {thread: page for thread, page in self._threads.items() if thread.is_alive()}
-        thread = threading.Thread(target=self._write, args=(path, result, origin), name='report', daemon=True)
+        before = [thread for thread, page in self._threads.items() if page == path]
+        thread = threading.Thread(target=self._write, args=(path, result, origin, older, before),
+                                  name='report', daemon=True)
         self._threads[thread] = path
         thread.start()
 
@@ -53,8 +59,13 @@ class ReportWriter:
                 self._failures.put((path, f'it was not ready {PATIENCE:.0f} s after the end'))
         self._threads = {}
 
-    def _write(self, path: Path, result: CalibrationResult, origin: Origin) -> None:
+    def _write(self, path: Path, result: CalibrationResult, origin: Origin, older: Path | None,
+               before: list[threading.Thread]) -> None:
         try:
+            for thread in before:
+                thread.join()
+            if older is not None and path.exists():
+                path.replace(older)
             write_report(path, result, origin,
                          lambda: sliced(result, origin.options, self._make_simulator, self._stop.is_set))
         except Exception as error:  # the user must learn why there is no page

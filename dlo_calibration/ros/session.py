@@ -123,9 +123,10 @@ class CalibrationSession:
         self._tell_refusals(situation.counted.due(self._clock()))
 
     def request(self, name: str) -> tuple[bool, str]:
-        """Serve a request `start`, `stop` or `reset`; return whether that succeeded, and the answer."""
+        """Serve a request; return whether that succeeded, and the answer."""
         try:
-            answer = {'start': self._start, 'stop': self._stop, 'reset': self._reset}[name]()
+            answer = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
+                      'discard_last': self._discard_last}[name]()
         except Exception as error:
             answer = str(error) if isinstance(error, DloCalibrationError) else f'{error!r}; {DEFECT}'
             self.refuse(answer)
@@ -188,6 +189,8 @@ class CalibrationSession:
             self._collector.add(message)
             for refusal in (*self._collector.take_news(), *self._collector.take_doubts()):
                 self.refuse(str(refusal))
+            for early in self._collector.take_early():
+                self._graph.info(f'{early.thing}: came before the first initial chain; not used')
         except Exception as error:
             return why(error, message.kind)
         return ''
@@ -272,6 +275,19 @@ class CalibrationSession:
         self._forget()
         return 'the trials are forgotten'
 
+    def _discard_last(self) -> str:
+        self._require_idle('~/discard_last')
+        self._graph.hear_waiting()  # messages sent before the request belong to that trial
+        before = self._collector.count
+        self._recorder.taken_back(*self._collector.take_back())
+        situation, count = self._situation, self._collector.count
+        self._appraiser.stop()
+        situation.state, situation.detail, situation.information = 'collecting', '', None
+        situation.appraisal.wanted = True
+        self._show()
+        which = f'trial {before}' if count < before else 'the incomplete trial'
+        return f'{which} is taken back; {count} trial(s) are left'
+
     def _forget(self) -> None:
         """Begin another session; a calibration under way goes on."""
         self._tell_dropped(at_once=True)
@@ -324,7 +340,8 @@ class CalibrationSession:
         self._outlet.send('result', diagnostics.result(self._types, event, self._graph.stamp()))
         self._outlet.send('dlo_description', self._types.build(
             OUTPUT_TYPES['dlo_description'], data=description_document(event, options.flat()).decode()))
-        self._recorder.result(event, options)
+        if older := self._recorder.result(event, options):
+            self._graph.info(older)
         self._recorder.finish(interrupted=self._worker.stopped)
         self._show()
         self._report()

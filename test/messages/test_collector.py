@@ -176,6 +176,39 @@ def test_other_options_judge_the_same_messages_again():
     assert "expected 'world'" in refused(wide, initial(8, frame='map'))
 
 
+# ---- trials that are taken back
+
+FIRST, SECOND = (initial(1), action(2), goal(5)), (initial(11), action(12), goal(15))
+
+
+@pytest.mark.parametrize('count', range(2, 4))
+def test_the_newest_trial_is_taken_back_complete_or_not_and_what_a_tracker_sends_of_it(count):
+    collector = collect(*FIRST, *SECOND[:count])
+    assert collector.take_back() == (ns(11), SECOND[count - 1].stamp)
+    alone = contents(collect(*FIRST).trials)
+    for message in (goal(16), goal(13, move=0.1), action(17), initial(11.5)):
+        collector.add(message)
+        assert contents(collector.trials) == contents(collector.with_options(Options()).trials) == alone
+    assert (collector.incomplete, collector.problems, collector.loose_end) == ('', (), ())
+    for message in (initial(21), action(22), goal(25)):
+        collector.add(message)
+    assert contents(collector.trials) == contents(collect(*FIRST, initial(21), action(22), goal(25)).trials)
+    for _ in range(2):
+        collector.take_back()
+    with pytest.raises(InputError, match='got no trial, expected one'):
+        collector.take_back()
+
+
+def test_initial_chains_of_the_next_trial_stay_when_one_is_taken_back():
+    collector = collect(*FIRST, *SECOND, initial(20))
+    assert collector.take_back() == (ns(11), ns(15))
+    collector.add(goal(16))
+    collector.add(initial(18))  # a late one, and an earlier start of a trial
+    for message in (action(22), goal(25)):
+        collector.add(message)
+    assert contents(collector.trials) == contents(collect(*FIRST, initial(20), action(22), goal(25)).trials)
+
+
 # ---- frames and repetitions
 
 def test_another_frame_is_refused():

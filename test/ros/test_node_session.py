@@ -100,9 +100,12 @@ def test_what_comes_after_the_start_is_for_the_next_one(start, tmp_path, command
     second = graph.calibrated()
     assert whole(second)['trials'] == '2'
     assert score(command, folder) == whole(second)['score']
-    assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_2.xml'}
+    assert {file.name for file in folder.glob('*.xml')} == {'result.xml', 'result_1.xml'}
+    assert read_result(folder / 'result.xml').score == float(whole(second)['score'])
+    assert read_result(folder / 'result_1.xml').score == float(whole(first)['score'])
+    assert any(text.endswith('the one before is result_1.xml there') for text in graph.logged['info'])
     graph.session.close()
-    assert {file.name for file in folder.glob('*.html')} == {'report.html', 'report_2.html'}
+    assert {file.name for file in folder.glob('*.html')} == {'report.html', 'report_1.html'}
 
 
 def test_requests_that_do_not_fit_are_refused_and_stop_gives_the_best_so_far(start):
@@ -215,6 +218,51 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
     assert graph.status['last_refusal'].endswith(' (50 times)')
     graph.send(session_messages(TYPES, 1))  # a trial is told at once
     assert graph.status['trials'] == '1'
+
+
+def test_a_trial_that_is_taken_back_is_left_out_by_the_replay_too(start, tmp_path, command):
+    graph = start()
+    assert graph.session.request('discard_last') == (
+        False, '~/discard_last: got no trial, expected one; there is nothing to take back')
+    graph.send(session_messages(TYPES, 2))
+    assert graph.session.request('discard_last') == (True, 'trial 2 is taken back; 1 trial(s) are left')
+    assert graph.status['trials'] == '1'
+    _, _, (_, goal) = session_messages(TYPES, 1, first=1)
+    goal.header.stamp.sec += 5  # the tracker goes on
+    graph.send([(GOAL, goal)])
+    assert graph.status['last_refusal'].startswith('~/discard_last')
+    graph.send(session_messages(TYPES, 1, first=2)[:2])
+    answer = graph.session.request('discard_last')[1]
+    assert answer == 'the incomplete trial is taken back; 1 trial(s) are left'
+    graph.send(session_messages(TYPES, 1, first=3))
+    live = graph.calibrated()
+    assert whole(live)['trials'] == '2'
+    folder, = folders(tmp_path)
+    assert score(command, folder) == whole(live)['score']
+    assert '6 message(s) of 2 trial(s) that were taken back are left out' in read_session(folder).problems
+
+
+def test_nothing_is_taken_back_while_it_calibrates(start):
+    graph = start(ToySimulator(0.01), evaluations=1000)
+    graph.send(session_messages(TYPES, 1))
+    assert graph.session.request('start')[0]
+    done, answer = graph.session.request('discard_last')
+    assert not done and answer.startswith('~/discard_last: got a calibration under way')
+    assert graph.status['trials'] == '1'
+    graph.session.request('stop')
+
+
+def test_goals_of_a_tracker_before_the_first_initial_chain_are_counted_and_no_refusal(start):
+    graph = start()
+    goal = session_messages(TYPES, 1)[2][1]
+    seconds = goal.header.stamp.sec
+    for k in range(5):
+        goal.header.stamp.sec = seconds - 40 + k
+        graph.send([(GOAL, goal)])
+    graph.send(session_messages(TYPES, 1))
+    assert (graph.status['last_refusal'], graph.status['trials']) == ('', '1')
+    told, = (text for text in graph.logged['info'] if text.startswith('goal_chain'))
+    assert told.endswith('and 4 more: came before the first initial chain; not used')
 
 
 def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):

@@ -40,6 +40,17 @@ def test_page_has_slices_simulated_elsewhere(result, tmp_path):
     assert list(reporter.failures()) == []
 
 
+def test_the_newest_page_keeps_its_name_though_the_one_before_is_still_being_written(
+        result, tmp_path, without_drawings):
+    reporter = ReportWriter(lambda _: ToySimulator(0.01))
+    reporter.begin(tmp_path / 'report.html', result, Origin('session', 'the first', OPTIONS))
+    reporter.begin(tmp_path / 'report.html', result, Origin('session', 'the second', OPTIONS),
+                   tmp_path / 'report_1.html')
+    reporter.close()
+    assert 'the second' in (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert 'the first' in (tmp_path / 'report_1.html').read_text(encoding='utf-8')
+
+
 def test_closing_waits_for_the_page_but_not_for_its_slices(result, tmp_path, without_drawings):
     reporter = ReportWriter(lambda _: ToySimulator(0.1))  # the slices would take half a minute
     reporter.begin(tmp_path / 'report.html', result, ORIGIN)

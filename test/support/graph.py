@@ -40,7 +40,7 @@ class Robot:
     inputs = INPUT_TYPES
     outputs = {name: OUTPUT_TYPES[name] for name in ('progress', 'status', 'result')}
     unlatched = ('progress',)
-    services = ('start', 'stop', 'reset')
+    services = ('start', 'stop', 'reset', 'discard_last')
 
     def __init__(self, context, reliability=ReliabilityPolicy.RELIABLE):
         self.context = context
