@@ -120,6 +120,7 @@ class TrialCollector:
         if key > self._newest:
             self._newest = key
             if message.kind == INITIAL and last.busy:
+                self._news += last.disturbed(self._options)
                 last = TrialBuilder(key)
                 self._builders.append(last)
             before = last.spare
@@ -164,7 +165,8 @@ class TrialCollector:
     def trials(self) -> tuple[Trial, ...]:
         """The complete trials in the order of their stamps: ``trial 1``, ``trial 2``, ..."""
         complete = [builder for builder in self._builders if builder.complete]
-        return tuple(builder.build(f'trial {k}') for k, builder in enumerate(complete, start=1))
+        return tuple(builder.build(f'trial {k}', self._options)
+                     for k, builder in enumerate(complete, start=1))
 
     def manipulations(self) -> tuple[tuple[Manipulation, ...], tuple[InputError, ...]]:
         """
@@ -203,6 +205,7 @@ class TrialCollector:
         They include those that later messages caused, but not those that `take_news` returns.
         """
         found = [error for builder in self._builders for _, error in builder.refused]
+        found += [error for builder in self._builders for error in builder.disturbed(self._options)]
         for builder, following in pairwise(one for one in self._builders[1:] if one.until is None):
             found += _cut_off(builder, f'and {following.starts[0]}',
                               'send no initial chain before the trial is complete')
@@ -228,7 +231,8 @@ class TrialCollector:
     def _doubt(self, k: int) -> None:
         """Look whether a builder's trial is plausible, each time that its goals are twice as many."""
         builder = self._builders[k] if k < len(self._builders) else None
-        if builder is None or not builder.complete or builder.judged == DOUBTED:
+        if builder is None or not builder.complete or builder.judged == DOUBTED \
+                or builder.unsettled(self._options):
             return
         judged = len(builder.views).bit_length(), builder.judged[1] or builder.views[-1].stable
         if judged == builder.judged:
@@ -236,7 +240,7 @@ class TrialCollector:
         builder.judged = judged
         complete = [other for other in self._builders[:k + 1] if other.complete]
         before = complete[-2].trial if len(complete) > 1 else None
-        trial, options = builder.build(f'trial {len(complete)}'), self._options
+        trial, options = builder.build(f'trial {len(complete)}', self._options), self._options
         height = options.table_height if options.table else None
         found = implausible(trial, height, bool(options.scene), before)
         if found:

@@ -17,6 +17,7 @@ from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, 
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, length_change
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.observation.rest import Rest, STILL, STREAM, Stream
 
 Message = Union[ChainMessage, ActionMessage]
 Key = tuple[int, int, tuple[str, ...]]
@@ -47,6 +48,60 @@ class GoalView:
     names: tuple[str, ...]
     stable: bool
     held_by: tuple[str, ...]
+    after: int  # number of actions that are over
+    end: int  # when the last one of them was over [ns]
+    opened: bool  # whether a hand opened then
+
+
+@dataclass
+class Stretch:
+    """Successive goal chains with the same actions before them, all stable or all timed."""
+
+    stream: Stream
+    views: list[GoalView] = field(default_factory=list)
+
+    def goes_on_with(self, view: GoalView) -> bool:
+        """Tell whether a later goal chain belongs to it."""
+        last = self.views[-1]
+        return (last.stable, last.after, last.held_by) == (view.stable, view.after, view.held_by)
+
+    def add(self, view: GoalView) -> None:
+        """Take the next goal chain."""
+        self.views.append(view)
+        if view.stable:
+            self.stream.add((view.message.stamp - view.end) / NANOSECONDS, view.message.chain)
+
+    @property
+    def rest(self) -> Rest | None:
+        """Where the DLO rests; None for a few chains, each of which counts, and while it moves."""
+        return self.stream.rest() if self.stream.count >= STREAM else None
+
+    @property
+    def left_out(self) -> list[GoalView]:
+        """The goal chains that show the DLO after it came to rest, and moved again."""
+        rest = self.rest
+        return [] if rest is None or rest.moved is None else self.views[rest.moved:]
+
+    def goals(self, zero: int) -> list[Goal]:
+        """
+        Return the goals; those of a stream that shows the DLO at rest are one, their mean.
+
+        The chains before are goals at their instants, unless a hand has opened: a message does not tell to
+        0.1 s when it did, and a fall of 0.1 s is 5 cm. They are left out then; if none shows rest, the last
+        one counts.
+        """
+        rest, streamed = self.rest, self.stream.count >= STREAM
+        seen = self.views if rest is None else self.views[:rest.first + 1]
+        if streamed and seen[-1].opened:
+            seen = seen[-1:]
+        times = seconds((view.message.stamp for view in seen), zero).tolist()
+        goals = [Goal(view.message.chain, time, view.stable and (view.opened or not streamed), view.held_by)
+                 for view, time in zip(seen, times, strict=True)]
+        if rest is not None:
+            chain = seen[-1].message.chain
+            goals[-1] = replace(goals[-1], stable=True, count=rest.count,
+                                chain=Chain(rest.points, chain.hands, chain.features))
+        return goals
 
 
 def _message_order(entry: Move | GoalView) -> Key:
@@ -76,6 +131,7 @@ class TrialBuilder:
     refused: list[tuple[Message, InputError]] = field(default_factory=list)
     trial: Trial | None = None
     judged: tuple[int, bool] = (0, False)  # see `TrialCollector`
+    _stretches: list[Stretch] = field(default_factory=list)
 
     @property
     def busy(self) -> bool:
@@ -185,17 +241,19 @@ class TrialBuilder:
             held_by = tuple(latest.names[k - 1] for k in numbers)
         elif not options.release:
             held_by = tuple(dict.fromkeys(name for move in finished for name in move.message.names))
-        return GoalView(goal, latest.names, bool(finished) and not under_way, held_by)
+        last = max(finished, key=lambda move: move.instants[-1], default=self.moves[-1])
+        return GoalView(goal, latest.names, bool(finished) and not under_way, held_by, len(finished),
+                        last.instants[-1], not set(last.message.names) <= set(held_by))
 
-    def build(self, name: str) -> Trial:
+    def build(self, name: str, options: Options) -> Trial:
         """Return the trial once it is complete; the same object until a message changes it."""
         if self.trial is None:
-            self.trial = self._build(name)
+            self.trial = self._build(name, options)
         elif self.trial.name != name:
             self.trial = replace(self.trial, name=name)
         return self.trial
 
-    def _build(self, name: str) -> Trial:
+    def _build(self, name: str, options: Options) -> Trial:
         start, velocity = self.starts[-1], self._velocity()
         zero = start.stamp
         if velocity is None:
@@ -205,9 +263,34 @@ class TrialBuilder:
                               move.message.positions[:, k], move.message.orientations[:, k])
                          for k, hand in enumerate(move.message.names)))
             for move in self.moves)
-        goals = tuple(Goal(one.message.chain, float(seconds([one.message.stamp], zero)[0]), one.stable,
-                           one.held_by) for one in self.views)
+        goals = tuple(goal for stretch in self._followed(options) for goal in stretch.goals(zero))
         return Trial(name, start.chain, actions, goals, velocity)
+
+    def _followed(self, options: Options) -> list[Stretch]:
+        """Return the goal chains, action by action; only those that are new are looked at."""
+        for view in self.views[sum(len(stretch.views) for stretch in self._stretches):]:
+            if not self._stretches or not self._stretches[-1].goes_on_with(view):
+                self._stretches.append(Stretch(Stream(
+                    options.stable_time, options.stable_distance, options.settle_limit)))
+            self._stretches[-1].add(view)
+        return self._stretches
+
+    def unsettled(self, options: Options) -> bool:
+        """Tell whether the newest goal chain is one of a stream that does not yet show the DLO at rest."""
+        soon = len(self.views) > 1 and (
+            self.views[-1].message.stamp - self.views[-2].message.stamp < STILL * NANOSECONDS)
+        return soon and self.views[-1].stable and self._followed(options)[-1].rest is None
+
+    def disturbed(self, options: Options) -> tuple[InputError, ...]:
+        """Return why goal chains after a DLO came to rest are left out, if some are."""
+        if not self.complete:
+            return ()
+        left_out = [view for stretch in self._followed(options) for view in stretch.left_out]
+        if not left_out:
+            return ()
+        return InputError(
+            str(left_out[0].message), 'a DLO that had come to rest and moves again', 'an action before that',
+            'the goal chains from then on are left out; if a hand moved the DLO, send the action'),
 
     def _velocity(self) -> Floats | None:
         if len(self.starts) < 2:

@@ -27,12 +27,14 @@ class Goal:
     :param stable: True: the simulated DLO is compared when it has come to rest
         after `time`; False: it is compared at that instant.
     :param held_by: names of the hands that still hold the DLO in this goal.
+    :param count: number of chains of which `chain` is the mean: its noise is that much lower.
     """
 
     chain: Chain
     time: float
     stable: bool = True
     held_by: tuple[str, ...] = ()
+    count: int = 1
 
     def __post_init__(self) -> None:
         if not abs(self.time) <= MAXIMUM_TIME:

@@ -26,16 +26,16 @@ def noise(trials: Sequence[Trial]) -> float:
 
     It comes from the roughness of the chains along the DLO, and for trials with a stream of goals also from
     the roughness of each point's path over time. The smaller one counts: bends make the first too large, fast
-    motion the second. nan where no chain has five points and no trial has a stream. Noise that is correlated
-    between neighbouring points, or from one instant to the next, as of a tracker that fits a smooth curve or
-    filters, is not seen.
+    motion the second. Means of many chains have hardly any noise left, and do not count. nan where no chain
+    has five points and no trial has a stream. Noise that is correlated between neighbouring points, or from
+    one instant to the next, as of a tracker that fits a smooth curve or filters, is not seen.
     """
     levels = []
     for streamed in (False, True):
         some = [trial for trial in trials if _is_stream(trial) == streamed]
         if some:
             along = noise_of([np.stack([one.observed for one in (
-                trial.initial, *(goal.chain for goal in trial.goals))]) for trial in some])
+                trial.initial, *(goal.chain for goal in trial.goals if goal.count == 1))]) for trial in some])
             level = np.fmin(along, _noise_over_time(some)) if streamed else along
             levels += [float(level)] * len(some)
     known = np.array(levels)[np.isfinite(levels)]

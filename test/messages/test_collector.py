@@ -17,6 +17,7 @@ from dlo_calibration.messages import collector as module
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.chain import Chain
+from dlo_calibration.observation.rest import Stream
 
 START = 1_700_000_000.0
 
@@ -484,7 +485,7 @@ def test_hour_of_initial_chains_is_one_start(monkeypatch):
 
 def test_what_trials_use_is_never_forgotten(monkeypatch):
     monkeypatch.setattr(module, 'KEPT', 20)
-    collector = collect(initial(1), action(2), *(goal(k / 10 + 2) for k in range(100)))
+    collector = collect(initial(1), action(2, times=(0, 10)), *(goal(k / 10 + 2) for k in range(100)))
     before = contents(collector.trials)
     for k in range(300):
         collector.add((goal if k % 2 else initial)(20 + k))
@@ -508,7 +509,7 @@ def test_refusals_do_not_pile_up(monkeypatch):
 @pytest.mark.parametrize(('name', 'most'), [('MOST_MESSAGES', 20), ('MOST_NUMBERS', 19 * 33 + 15)])
 def test_what_is_too_much_is_refused_after_what_no_trial_uses_is_forgotten(monkeypatch, name, most):
     monkeypatch.setattr(module, name, most)
-    collector = collect(initial(1), action(2), goal(5))
+    collector = collect(initial(1), action(2, times=(0, 60)), goal(5))
     for k in range(10):
         refused(collector, goal(10 + k, count=12))
     for k in range(17):
@@ -572,3 +573,116 @@ def test_messages_sent_twice_change_nothing(session, again):
     ordered, arrived, options = session
     twice = again.draw(st.permutations([*ordered, *ordered]))
     assert contents(feed(twice, options).trials) == contents(feed(arrived, options).trials)
+
+
+# ---- a tracker's stream
+
+def stream(begin, end, rate=30, move=lambda t: 0.0, seed=1, **rest):
+    """Goals of a tracker with noise of 1 mm, from `begin` to `end` [s]; `move` tells where the DLO is."""
+    generator = np.random.default_rng(seed)
+    messages = []
+    for at in np.arange(begin, end, 1 / rate):
+        one = goal(at, move=move(at), **rest)
+        noisy = Chain(one.chain.points + generator.normal(0, 1e-3, (11, 3)), one.chain.hands)
+        messages.append(replace(one, chain=noisy))
+    return messages
+
+
+def test_a_stream_that_shows_rest_is_one_goal_the_mean():
+    messages = stream(3.2, 13.2, move=lambda t: 0.3)
+    one, = only(initial(1), action(2), *messages).goals
+    assert one.stable
+    assert one.count > 280
+    np.testing.assert_allclose(one.chain.points[:, 1], 0.3, atol=3e-4)
+    assert one.time == pytest.approx(1.2, abs=1e-3)
+    longer, = only(initial(1), action(2), *messages, *stream(13.2, 23.2, seed=2)).goals
+    assert longer.time == one.time
+
+
+def test_after_a_hand_opened_a_stream_tells_nothing_before_it_shows_rest():
+    messages = stream(3.01, 6, move=lambda t: max(0.3 - 4.9 * (t - 3) ** 2, 0))
+    trial = only(initial(1), action(2), *stream(2, 3), *messages)
+    assert [one.stable for one in trial.goals] == [False] * 30 + [True]
+    assert np.abs(trial.goals[-1].chain.points[:, 1]).max() < 1e-3
+    early, = only(initial(1), action(2), *messages[:15]).goals
+    assert early.stable and early.chain.points.tobytes() == messages[14].chain.points.tobytes()
+
+
+def test_while_the_hand_holds_on_a_stream_in_motion_is_compared_at_its_instants():
+    messages = stream(3.01, 9, move=lambda t: 0.2 * np.exp(3 * (3 - t)) * np.cos(6 * t))
+    trial = only(initial(1), action(2), *messages, release=False)
+    *moving, last = trial.goals
+    assert len(moving) > 15 and not any(one.stable for one in moving)
+    assert [one.chain.points.tobytes() for one in moving] == [
+        one.chain.points.tobytes() for one in messages[:len(moving)]]
+    assert last.stable and last.held_by == ('left_hand',) and last.count > 60
+
+
+def test_a_few_goals_are_no_stream():
+    messages = stream(4, 5, rate=11)
+    assert [one.stable for one in only(initial(1), action(2), *messages).goals] == [True] * 11
+
+
+def test_each_action_ends_in_a_goal_of_its_own():
+    trial = only(initial(1), action(2), *stream(3.2, 6), action(6), *stream(7.2, 10, move=lambda t: 0.2))
+    assert [one.stable for one in trial.goals] == [True, True]
+    for one, place in zip(trial.goals, (0.0, 0.2), strict=True):
+        np.testing.assert_allclose(one.chain.points[:, 1], place, atol=1e-3)
+
+
+def test_what_moves_the_dlo_after_it_came_to_rest_is_told_once_when_the_next_trial_begins():
+    touched = stream(3.2, 9, move=lambda t: 0.1 * (t > 6))
+    collector = collect(initial(1), action(2), *touched)
+    assert collector.take_news() == ()  # an action that explains it may still come
+    problem, = collector.problems
+    assert 'goal_chain' in str(problem) and 'had come to rest and moves again' in str(problem)
+    one, = collector.trials[0].goals
+    assert np.abs(one.chain.points[:, 1]).max() < 1e-3
+    collector.add(initial(10, move=0.1))
+    assert list(map(str, collector.take_news())) == [str(problem)]
+    collector.add(action(11, away=0.1))
+    assert collector.take_news() == ()
+
+
+def test_an_action_that_is_sent_when_it_is_over_explains_why_the_dlo_moved():
+    messages = [initial(1), action(2), *stream(3.2, 10, move=lambda t: 0.3 * np.clip(t - 5.5, 0, 1))]
+    collector = collect(*messages)
+    assert collector.trials and collector.problems
+    collector.add(action(5.5))
+    assert collector.problems == ()
+    assert contents(collector.trials) == contents(collect(*messages, action(5.5)).trials) == contents(
+        collect(*sorted([*messages, action(5.5)], key=lambda one: one.stamp)).trials)
+
+
+def test_each_chain_of_a_stream_is_looked_at_once(monkeypatch):
+    looked = []
+    add = Stream.add
+    monkeypatch.setattr(Stream, 'add', lambda self, *rest: looked.append(self) or add(self, *rest))
+    collector = collect(initial(1), action(2))
+    for message in stream(3.2, 13.2):
+        collector.add(message)
+        assert len(collector.trials) == 1
+    assert len(looked) == 300
+    assert len(collector.trials[0].goals) == 1
+
+
+def test_a_dlo_that_a_stream_shows_falling_is_not_doubted_before_it_rests():
+    def at_height(message, height):
+        return replace(message, chain=Chain(message.chain.points + (0, 0, height)))
+
+    fall = [at_height(one, max(0.3 - 4.9 * (k / 30) ** 2, 0)) for k, one in enumerate(stream(3.01, 6))]
+    collector = collect(initial(1), action(2), *(at_height(one, 0.3) for one in stream(2, 3)), *fall)
+    assert collector.take_doubts() == ()
+    collector = collect(initial(1), action(2), *(at_height(one, 0.3) for one in stream(2, 6)))
+    doubt, = collector.take_doubts()
+    assert '300 mm above the table' in doubt
+
+
+def test_points_that_a_stream_shows_at_times_are_the_mean_of_when_it_does():
+    messages = stream(3.2, 6)
+    places = np.arange(11)[:, None]
+    hidden = [replace(one, chain=Chain(np.where(places == k % 4 + 2, np.nan, one.chain.points)))
+              for k, one in enumerate(messages)]
+    one, = only(initial(1), action(2), *hidden).goals
+    assert one.chain.seen.all()
+    np.testing.assert_allclose(one.chain.points, initial(1).chain.points, atol=1e-3)
