@@ -16,12 +16,13 @@ from made_up_plan import made_up_plan
 import pytest
 from ruamel.yaml import YAML
 
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.planning import PlanProgress
-from dlo_calibration.ros import diagnostics, planner_diagnostics, planner_session
+from dlo_calibration.ros import diagnostics, launching, planner_diagnostics, planner_session
 
 ROOT = Path(__file__).resolve().parents[2]
 FOXGLOVE = {'calibrator': ROOT / 'config' / 'foxglove_layout.json',
@@ -108,8 +109,44 @@ def test_launch_starts_rviz_only_where_it_is_asked_for(node, described):
 
 def test_launch_arguments_are_described(node, described):
     arguments = {one.words[0]: one.options for one in described if one.kind == 'DeclareLaunchArgument'}
-    assert set(arguments) == {'params_file', 'rviz', 'frame', *(['description'] if node == 'planner' else [])}
+    assert set(arguments) == {'params_file', 'namespace', 'goal_chain', 'rviz', 'frame', *(
+        ['description', 'chain'] if node == 'planner' else ['mass', 'table_height'])}
     assert all(one['description'] for one in arguments.values())
+
+
+def test_launch_passes_on_what_is_given_and_rviz_shows_it(node, monkeypatch):
+    monkeypatch.setattr(launching, 'check_rviz', lambda wanted: None)
+    given = {'namespace': 'left', 'goal_chain': '/trackdlo/results_pc', 'rviz': 'true'}
+    if node == 'calibrator':
+        given |= {'mass': '0.03', 'table_height': '0.7'}
+    started = {one.options['package']: one.options for one in launched(node, monkeypatch, **given)
+               if one.kind == 'Node'}
+    words = started['dlo_calibration']['ros_arguments'][2:]
+    assert words[-2:] == ['-r', '~/goal_chain:=/trackdlo/results_pc']
+    assert words[:-2] == (['-p', 'mass:=0.03', '-p', 'table_height:=0.7'] if node == 'calibrator' else [])
+    assert started['dlo_calibration']['namespace'] == 'left'
+    topics = {one['Topic']['Value'] for one in rviz_displays(node) if 'Topic' in one}
+    remapped = dict(started['rviz2']['remappings'])
+    assert set(remapped) == topics
+    assert remapped[f'/{node}/goal_chain'] == '/trackdlo/results_pc'
+    assert remapped[f'/{node}/markers'] == f'/left/{node}/markers'
+
+
+def test_launch_without_the_rviz_that_is_wanted_starts_nothing_and_says_so(node, monkeypatch):
+    with pytest.raises(InputError, match='rviz:=true: got no package rviz2, .*apt install'):
+        launched(node, monkeypatch, rviz='true')
+
+
+def test_launch_refuses_an_argument_that_it_does_not_know_and_lists_the_others(node, monkeypatch):
+    command = ['/opt/ros/jazzy/bin/ros2', 'launch', 'dlo_calibration', f'{node}.launch.py', 'rviz:=false']
+    monkeypatch.setattr(sys, 'argv', command)
+    launched(node, monkeypatch)
+    monkeypatch.setattr(sys, 'argv', [*command, 'tabel_height:=0.7'])
+    with pytest.raises(InputError, match='argument tabel_height, expected one of params_file, .*goal_chain'):
+        launched(node, monkeypatch)
+    # The arguments of another launch file, which includes this one, are its own.
+    monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', 'cell', 'cell.launch.py', 'robot:=left'])
+    launched(node, monkeypatch)
 
 
 def test_ros2_launch_knows_the_launch_file(node, install):
