@@ -113,6 +113,24 @@ def test_bloom_takes_every_key():
             assert element.text != 'mcap-ros2-support'
 
 
+def test_the_changelog_can_be_released():
+    """Do what catkin_prepare_release does, and read back what is then in the Debian package."""
+    changelog = pytest.importorskip('catkin_pkg.changelog')
+    package_version = pytest.importorskip('catkin_pkg.package_version')
+    text = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    label = package_version.get_forthcoming_label(text)
+    title = f'{setup_value("version")} (2030-01-01)'
+    released = text.replace(f'{label}\n{"-" * len(label)}', f'{title}\n{"-" * len(title)}')
+    found = changelog.populate_changelog_from_rst(changelog.Changelog(NAME), released)
+    (version, _, entries), = found.foreach_version()
+    assert version == setup_value('version')
+    assert sum(str(entry).count('* ') for entry in entries) >= text.count('\n* ')
+
+
+def test_rosdoc2_finds_its_configuration():
+    assert (ROOT / manifest().findtext('export/rosdoc2')).is_file()
+
+
 def test_colcon_puts_executables_where_ros2_run_looks(prefix):
     for name in EXECUTABLES:
         assert os.access(prefix / 'lib' / NAME / name, os.X_OK)
