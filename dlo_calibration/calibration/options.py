@@ -33,6 +33,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
@@ -57,6 +58,9 @@ class Options(DeclaredOptions):
     table: bool = declared(True, 'whether there is a table', of=OBSERVATION)
     table_height: float = declared(0.0, 'height of the table top', unit='m', minimum=-100.0, maximum=100.0,
                                    of=OBSERVATION)
+    frame_pose: str = declared(
+        '', "pose of the chains' and actions' frame in the table's frame, whose z is up: x y z [m] and a "
+        'quaternion qx qy qz qw, e.g. 0 0 -0.75 0 0 0 1; empty: they are the same frame', of=OBSERVATION)
     scene: str = declared(
         '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
         'relative to the working directory; a session or document can name only a file in its own folder; '
@@ -125,6 +129,7 @@ class Options(DeclaredOptions):
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
+        self.pose  # noqa: B018  # refuses a text that is no pose
         if AUTO in self.calibrate and self.calibrate != (AUTO,):
             raise InputError('parameter calibrate', ', '.join(self.calibrate), 'auto alone, or only names',
                              'leave auto out, and name every parameter to find')
@@ -150,6 +155,11 @@ class Options(DeclaredOptions):
         :raises InputError: if they contradict each other.
         """
         self.space  # noqa: B018
+
+    @property
+    def pose(self) -> Pose | None:
+        """The pose of the chains' frame in the table's frame; None: they are the same."""
+        return Pose.of(self.frame_pose) if self.frame_pose else None
 
     @property
     def space(self) -> ParameterSpace:

@@ -256,16 +256,20 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
     """
     Return the trials of a request, and the reasons why others are not used.
 
-    :param options: `length_tolerance` and `release` are used.
+    :param options: `length_tolerance`, `release` and `frame_pose` are used.
     """
-    trials, refusals = [], []
+    trials, refusals, pose = [], [], options.pose
     for one in request.trials:
         if not one.goals:
             refusals.append(str(InputError(
                 f'trial {one.name!r}', 'no goal chain', 'at least one',
                 'observe the DLO after the action, or predict it with dlo-calibration simulate')))
             continue
+        if pose is not None and not pose.upright and (named := _named(one)):
+            refusals.append(str(named))
+            continue
         trial = one.trial(options.release)
+        trial = trial if pose is None else pose.trial(trial)
         change = max(length_change(trial.initial, goal.chain) for goal in trial.goals)
         if change > options.length_tolerance:
             refusals.append(str(InputError(
@@ -281,9 +285,23 @@ def request_manipulations(request: Request, options: Options) -> tuple[Manipulat
     """
     Return what the hands do in each trial of a request, with or without goal chains.
 
-    :param options: `release` is used.
+    :param options: `release` and `frame_pose` are used.
+    :raises InputError: for a named action with a `frame_pose`: it begins where the DLO is predicted.
     """
-    return tuple(one.manipulation(options.release) for one in request.trials)
+    found, pose = [one.manipulation(options.release) for one in request.trials], options.pose
+    if pose is None:
+        return tuple(found)
+    for named in filter(None, map(_named, request.trials)):
+        raise named
+    return tuple(map(pose.manipulation, found))
+
+
+def _named(trial: TrialRequest) -> InputError | None:
+    """Return why the actions of a trial cannot be moved to another frame; None: they can."""
+    name = next((one.name for one in trial.actions if isinstance(one, NamedAction)), None)
+    return None if name is None else InputError(
+        f'trial {trial.name!r}', f'the action {name} with a frame_pose', 'hand_paths, as a named action '
+        "needs the table's frame", "give the paths of the hands, or all chains in the table's frame")
 
 
 def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:

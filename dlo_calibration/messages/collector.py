@@ -40,15 +40,17 @@ are too large together, those that no trial uses are forgotten; then further one
 from __future__ import annotations
 
 from bisect import bisect_right, insort
+from dataclasses import replace
 from itertools import pairwise
 from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ActionMessage, GOAL, INITIAL
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL
 from dlo_calibration.messages.manipulations import manipulation_of
 from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
 from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.plausibility import implausible
 
@@ -64,11 +66,13 @@ class TrialCollector:
 
     It must not be shared between threads.
 
-    :param options: `grip_tolerance`, `length_tolerance` and `release` are used.
+    :param options: those of the observation are used; `frame_pose` brings chains and actions into the table's
+        frame.
+    :ivar pose: of the messages' frame in that of the trials; None: they are the same.
     """
 
     def __init__(self, options: Options) -> None:
-        self._options = options
+        self._options, self.pose = options, options.pose
         self.clear()
 
     def clear(self) -> None:
@@ -116,6 +120,8 @@ class TrialCollector:
         self._frame = message.frame_id
         self._known[key] = message
         self._numbers += _size(message)
+        if self.pose is not None:
+            message = _moved(message, self.pose)
         last, without_start = self._builders[-1], len(self._builders) == 1
         if key > self._newest:
             self._newest = key
@@ -380,6 +386,14 @@ class TrialCollector:
             else:
                 merged.append(span)
         self._forgotten = merged
+
+
+def _moved(message: Message, pose: Pose) -> Message:
+    """Return a message in another frame."""
+    if isinstance(message, ActionMessage):
+        return replace(message, positions=pose.points(message.positions),
+                       orientations=pose.orientations(message.orientations))
+    return ChainMessage(message.kind, message.stamp, message.frame_id, pose.chain(message.chain))
 
 
 def _size(message: Message) -> int:

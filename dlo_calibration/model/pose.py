@@ -5,15 +5,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import far_from_unit, quaternion_lengths
-from dlo_calibration.model.chain import check_size, Floats, frozen_array
+from dlo_calibration.model.action import Action, far_from_unit, Hand, quaternion_lengths
+from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
+from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.model.trial import Trial
 
 NUMBERS = 'x y z qx qy qz qw'
 
@@ -32,22 +34,29 @@ class Pose:
 
     def __post_init__(self) -> None:
         position, orientation = frozen_array(self.position), np.array(self.orientation, dtype=float)
-        check_size('pose', 'position', position[None, :])
+        check_size('frame_pose', 'position', position[None, :])
         length = quaternion_lengths(orientation)
         if not (np.isfinite(position).all() and np.isfinite(length)) or bool(far_from_unit(length)):
-            raise InputError('pose', ' '.join(f'{one:g}' for one in (*position, *orientation)),
+            raise InputError('frame_pose', ' '.join(f'{one:g}' for one in (*position, *orientation)),
                              f'finite numbers {NUMBERS} with a unit quaternion', 'correct it')
         object.__setattr__(self, 'position', position)
         object.__setattr__(self, 'orientation', frozen_array(orientation / length))
 
     @classmethod
-    def of(cls, text: str) -> Self | None:
-        """Return the pose that seven numbers give, in metres; None where the text is not seven numbers."""
+    def of(cls, text: str) -> Self:
+        """
+        Return the pose that seven numbers give, as `str` writes them.
+
+        :raises InputError: if the text is not that.
+        """
         try:
-            numbers = [float(word) for word in text.replace(',', ' ').split()]
+            numbers = [float(word) for word in text.split()]
         except ValueError:
-            return None
-        return cls(np.array(numbers[:3]), np.array(numbers[3:])) if len(numbers) == 7 else None
+            numbers = []
+        if len(numbers) != 7:
+            raise InputError('frame_pose', repr(text), f'the numbers {NUMBERS}',
+                             'give metres and a unit quaternion, with blanks between them')
+        return cls(np.array(numbers[:3]), np.array(numbers[3:]))
 
     def __str__(self) -> str:
         return ' '.join(repr(one) for one in (*self.position.tolist(), *self.orientation.tolist()))
@@ -65,6 +74,11 @@ class Pose:
         """The pose of the other frame in this one."""
         return Pose(-self.position @ self.rotation, self.orientation * [-1.0, -1.0, -1.0, 1.0])
 
+    @property
+    def upright(self) -> bool:
+        """Whether z is up in both frames."""
+        return bool(self.rotation[2, 2] > 1 - 1e-9)
+
     def points(self, points: Floats) -> Floats:
         """Return (..., 3) points of the frame in the other one [m]."""
         return np.asarray(points @ self.rotation.T + self.position)
@@ -78,3 +92,24 @@ class Pose:
         (x, y, z, w), (i, j, k, r) = self.orientation, np.moveaxis(orientations, -1, 0)
         return np.stack([w * i + x * r + y * k - z * j, w * j - x * k + y * r + z * i,
                          w * k + x * j - y * i + z * r, w * r - x * i - y * j - z * k], axis=-1)
+
+    def chain(self, chain: Chain) -> Chain:
+        """Return a chain of the frame in the other one."""
+        return replace(chain, points=self.points(chain.points))
+
+    def trial(self, trial: Trial) -> Trial:
+        """Return a trial of the frame in the other one."""
+        return replace(
+            trial, initial=self.chain(trial.initial), actions=tuple(map(self._action, trial.actions)),
+            goals=tuple(replace(goal, chain=self.chain(goal.chain)) for goal in trial.goals),
+            velocity=None if trial.velocity is None else self.vectors(trial.velocity))
+
+    def manipulation(self, one: Manipulation) -> Manipulation:
+        """Return a manipulation of the frame, with explicit paths only, in the other one."""
+        return replace(one, start=self.chain(one.start), steps=tuple(
+            replace(step, actions=tuple(self._action(action) if isinstance(action, Action) else action
+                                        for action in step.actions)) for step in one.steps))
+
+    def _action(self, action: Action) -> Action:
+        return Action(tuple(Hand(hand.name, hand.grips, hand.times, self.points(hand.positions),
+                                 self.orientations(hand.orientations)) for hand in action.hands))

@@ -12,8 +12,9 @@ import numpy as np
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import MessageTypes
-from dlo_calibration.model.action import Hand
+from dlo_calibration.model.action import Hand, NO_ROTATION
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
@@ -34,7 +35,7 @@ HAND_COLOURS = ((0.2, 0.8, 0.3), (0.75, 0.45, 0.9), (0.75, 0.55, 0.4), (0.95, 0.
 
 
 def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_id: str,
-            result: CalibrationResult | None = None) -> Any:
+            result: CalibrationResult | None = None, pose: Pose | None = None) -> Any:
     """
     Build the message that shows trials; it replaces everything that earlier messages show.
 
@@ -42,15 +43,16 @@ def markers(types: MessageTypes, trials: Sequence[Trial], *, stamp: int, frame_i
     An id follows from the index of a goal or a hand, so it is the same in every message.
 
     :param frame_id: of the session.
+    :param pose: of that frame in the one of the trials; None: they are the same.
     :param result: its rollouts are shown with those of `trials` that it was calibrated on.
     """
-    header = types.header(stamp, frame_id)
+    header, back = types.header(stamp, frame_id), None if pose is None else pose.inverse
     built = [cleared(types, header)]
     simulated = {} if result is None else {
         trial.name: (trial, chains) for trial, chains in zip(result.trials, result.chains, strict=True)}
     for k, trial in enumerate(trials):
         of_result, chains = simulated.get(trial.name, (trial, None))
-        brush = Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length)
+        brush = Brush(types, header, f'trial_{k + 1}', 0.01 * trial.initial.length, back)
         built += _trial_markers(brush, trial, chains if _same(trial, of_result) else None, k)
     return types.build(OUTPUT_TYPES['markers'], markers=built)
 
@@ -129,9 +131,12 @@ class Brush:
 
     :param prefix: first part of all namespaces, e.g. ``trial_1``.
     :param thickness: of a line [m]; the `scale` of a marker is a multiple of it.
+    :param pose: of the frame of what is drawn, in that of the header; None: they are the same.
     """
 
-    def __init__(self, types: MessageTypes, header: Any, prefix: str, thickness: float) -> None:
+    def __init__(self, types: MessageTypes, header: Any, prefix: str, thickness: float,
+                 pose: Pose | None = None) -> None:
+        self._pose = pose or Pose(np.zeros(3), np.array(NO_ROTATION))
         self.thickness = thickness
         self._types = types
         self._header = header
@@ -163,14 +168,15 @@ class Brush:
         build = self._types.build
         points = np.zeros((0, 3)) if points is None else points
         kept = _kept(len(points), group)
-        x, y, z = (0.0, 0.0, 0.0) if at is None else (float(value) for value in at)
+        x, y, z = self._pose.points(np.zeros(3) if at is None else at).tolist()
+        turn = dict(zip('xyzw', self._pose.orientation.tolist(), strict=True))
         size = scale * self.thickness
         # In `scale`, lines use only x, and texts only z.
         return build(
             'visualization_msgs/msg/Marker', header=self._header, ns=f'{self._prefix}/{name}' if name else '',
             id=number, type=kind, action=action,
             pose=build('geometry_msgs/msg/Pose', position=build('geometry_msgs/msg/Point', x=x, y=y, z=z),
-                       orientation=build('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)),
+                       orientation=build('geometry_msgs/msg/Quaternion', **turn)),
             scale=build('geometry_msgs/msg/Vector3', x=size, y=size, z=size),
             color=self._colour(colours[0]),
             lifetime=build('builtin_interfaces/msg/Duration', sec=0, nanosec=0), frame_locked=False,

@@ -79,4 +79,5 @@ class Outlet:
         """Send the markers of all trials."""
         situation.markers = Pace(last=self._clock())
         self.send('markers', markers(self._types, collector.trials, stamp=self._graph.stamp(),
-                                     frame_id=collector.frame_id, result=situation.result))
+                                     frame_id=collector.frame_id, result=situation.result,
+                                     pose=collector.pose))

@@ -137,6 +137,8 @@ def values(declaration):
         names = st.lists(st.sampled_from([one for one in declaration.choices if one != 'auto']), min_size=1,
                          unique=True)
         return names | st.just(['auto'])
+    if declaration.name == 'frame_pose':
+        return st.sampled_from(['', '0 0 -0.75 0 0 0 1', '0.1 0.2 1.5 1.0 0 0 0'])
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
 
 

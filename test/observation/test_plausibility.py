@@ -37,14 +37,13 @@ def lying():
 
 def moved(trial, position=(0.0, 0.0, 0.0), orientation=LEVEL, scale=1.0):
     """Return a trial as seen from a frame with another pose or unit."""
-    pose = Pose(position, orientation)
+    trial = Pose(position, orientation).trial(trial)
 
     def chain(one):
-        return replace(one, points=scale * pose.points(one.points))
+        return replace(one, points=scale * one.points)
 
-    hands = [tuple(Hand(hand.name, hand.grips, hand.times, scale * pose.points(hand.positions),
-                        pose.orientations(hand.orientations)) for hand in action.hands)
-             for action in trial.actions]
+    hands = [tuple(Hand(hand.name, hand.grips, hand.times, scale * hand.positions, hand.orientations)
+                   for hand in action.hands) for action in trial.actions]
     return replace(trial, initial=chain(trial.initial), actions=tuple(map(Action, hands)),
                    goals=tuple(replace(goal, chain=chain(goal.chain)) for goal in trial.goals))
 

@@ -15,6 +15,7 @@ from wire import wire
 
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.trial import Goal
 from dlo_calibration.ros.markers import error_colour, markers, MOST_POINTS
@@ -43,6 +44,22 @@ def shown(types, trials, result=None):
 
 def points(marker):
     return np.array([[p.x, p.y, p.z] for p in marker.points])
+
+
+def test_markers_stay_in_the_frame_of_the_chains(types):
+    """A viewer turns and moves the points of a marker by its pose."""
+    camera = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])
+    trial = toy_trials(1)[0]
+    array = wire(types)(markers(types, [trial], stamp=STAMP, frame_id='camera', pose=camera))
+    seen = {marker.ns: marker for marker in array.markers}
+    line, label = seen['trial_1/initial'], seen['trial_1/label']
+    at, turn = line.pose.position, line.pose.orientation
+    shown = Pose([at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]).points(points(line))
+    assert np.allclose(shown, camera.inverse.points(trial.initial.points))
+    at = label.pose.position
+    above = camera.points(np.array([at.x, at.y, at.z])) - trial.initial.points[0]
+    assert np.allclose(above[:2], 0)
+    assert above[2] > 0
 
 
 def test_collected_trials_show_initial_and_goal_chains_and_hands(types):

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""With frame_pose, a camera that looks down at an angle gives the trials of the table's frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.recording import SessionWriter
+from dlo_calibration.files.request import (
+    Request,
+    request_manipulations,
+    request_trials,
+    TrialRequest,
+    write_request,
+)
+from dlo_calibration.files.session import read_session, session_manipulations, trial_records
+from dlo_calibration.model.named_actions import LiftAndHold
+from dlo_calibration.model.pose import Pose
+
+CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])  # in the table's frame
+TEXT = str(CAMERA)
+
+
+@pytest.fixture
+def seen():
+    """Give two trials in the frame of the camera."""
+    return [CAMERA.inverse.trial(trial) for trial in toy_trials(2)]
+
+
+def assert_on_the_table(trials):
+    for trial, true in zip(trials, toy_trials(2), strict=True):
+        assert np.allclose(trial.initial.points, true.initial.points, atol=1e-12)
+        assert np.allclose(trial.goals[0].chain.points, true.goals[0].chain.points, atol=1e-12)
+        for hand, right in zip(trial.hands, true.hands, strict=True):
+            assert np.allclose(hand.positions, right.positions, atol=1e-12)
+            assert np.allclose(hand.poses(hand.times)[1], right.poses(hand.times)[1], atol=1e-12)
+
+
+def record(path, trials, **options):
+    with SessionWriter(path, options) as writer:
+        for one in trial_records(trials, 'camera'):
+            writer.write(one.topic, one.type, one.data, one.log_time)
+        return writer.path
+
+
+def test_a_recorded_session_holds_the_messages_as_they_came_and_the_pose(tmp_path, seen):
+    session = read_session(record(tmp_path / 'session', seen, frame_pose=TEXT))
+    assert_on_the_table(session.trials)
+    raw = read_session(record(tmp_path / 'raw', seen)).trials
+    assert np.allclose(raw[0].initial.points, seen[0].initial.points)
+    found, _ = session_manipulations(session, session.options)
+    assert np.allclose(found[0].start.points, toy_trials(1)[0].initial.points, atol=1e-12)
+
+
+def test_a_request_and_the_flag(tmp_path, seen, command):
+    request = Request(tuple(map(TrialRequest.of, seen)), {'frame_pose': TEXT})
+    trials, _ = request_trials(request, Options.of(request.options))
+    assert_on_the_table(trials)
+    found = request_manipulations(request, Options.of(request.options))
+    assert np.allclose(found[1].start.points, toy_trials(2)[1].initial.points, atol=1e-12)
+    write_request(tmp_path / 'request.xml', Request(request.trials))
+    _, wrong, _ = command('info', tmp_path / 'request.xml', '--json')
+    assert 'got a DLO' in wrong['problems'][0]
+    _, right, _ = command('info', tmp_path / 'request.xml', '--json', '--frame-pose', TEXT)
+    assert right['problems'] == []
+
+
+def test_a_named_action_needs_a_frame_whose_z_is_up(seen):
+    lift = LiftAndHold(point=0, height=0.1)
+    request = Request((replace(TrialRequest.of(seen[0]), actions=(lift,)),))
+    trials, refusals = request_trials(request, Options(frame_pose=TEXT))
+    assert trials == ()
+    assert 'the action lift_and_hold with a frame_pose' in refusals[0]
+    assert len(request_trials(request, Options(frame_pose='0 0 -0.75 0 0 1 0'))[0]) == 1
+    with pytest.raises(InputError, match='lift_and_hold'):
+        request_manipulations(request, Options(frame_pose=TEXT))
+
+
+@pytest.mark.parametrize('text', ['0 0 1', '0,0,1,0,0,0,1', 'table'])
+def test_what_is_neither_a_pose_nor_a_name_is_refused(text):
+    with pytest.raises(InputError, match='frame_pose'):
+        Options(frame_pose=text)
