@@ -11,6 +11,7 @@ recorded in a session are all generated from these declarations.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import re
 from typing import Any, Mapping, Self
 
 from dlo_calibration.calibration.declaration import (
@@ -33,7 +34,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
-from dlo_calibration.model.pose import Pose
+from dlo_calibration.model.pose import NUMBERS, Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
@@ -60,7 +61,9 @@ class Options(DeclaredOptions):
                                    of=OBSERVATION)
     frame_pose: str = declared(
         '', "pose of the chains' and actions' frame in the table's frame, whose z is up: x y z [m] and a "
-        'quaternion qx qy qz qw, e.g. 0 0 -0.75 0 0 0 1; empty: they are the same frame', of=OBSERVATION)
+        'quaternion qx qy qz qw, e.g. 0 0 -0.75 0 0 0 1; or, for the node where tf2_ros is installed, the '
+        "name of the table's frame, whose transform it looks up; empty: they are the same frame",
+        of=OBSERVATION)
     scene: str = declared(
         '', 'path of a URDF file with fixed obstacles that the DLO can touch, in addition to the table; '
         'relative to the working directory; a session or document can name only a file in its own folder; '
@@ -129,7 +132,8 @@ class Options(DeclaredOptions):
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
-        self.pose  # noqa: B018  # refuses a text that is no pose
+        if self.frame_pose and self.table_frame is None:
+            Pose.of(self.frame_pose)  # refuses what is neither
         if AUTO in self.calibrate and self.calibrate != (AUTO,):
             raise InputError('parameter calibrate', ', '.join(self.calibrate), 'auto alone, or only names',
                              'leave auto out, and name every parameter to find')
@@ -157,8 +161,20 @@ class Options(DeclaredOptions):
         self.space  # noqa: B018
 
     @property
+    def table_frame(self) -> str | None:
+        """The name of the table's frame, if `frame_pose` is a name."""
+        return self.frame_pose if re.fullmatch(r'[A-Za-z_][\w/]*', self.frame_pose) else None
+
+    @property
     def pose(self) -> Pose | None:
-        """The pose of the chains' frame in the table's frame; None: they are the same."""
+        """
+        The pose of the chains' frame in the table's frame; None: they are the same.
+
+        :raises InputError: if only its name is known.
+        """
+        if self.table_frame is not None:
+            raise InputError('frame_pose', f'the name {self.table_frame!r}', f'the numbers {NUMBERS}',
+                             'give the pose; only the node looks up the transform of a frame')
         return Pose.of(self.frame_pose) if self.frame_pose else None
 
     @property

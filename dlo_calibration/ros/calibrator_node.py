@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import INPUT_TYPES
 from dlo_calibration.messages.stamp_order import MARGIN
@@ -29,6 +30,7 @@ from dlo_calibration.ros import graph_node
 from dlo_calibration.ros.graph_node import GraphNode, waiting
 from dlo_calibration.ros.inbox import Inbox
 from dlo_calibration.ros.session import CalibrationSession
+from dlo_calibration.ros.table_frame import TableFrame
 
 ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole
 SLICE = 0.02  # s of collecting between two looks at the queues, which overflow in 0.1 s in a flood
@@ -56,12 +58,18 @@ class CalibratorNode(GraphNode[Options]):
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
         super().__init__('calibrator', Options, INPUT_TYPES, **arguments)
+        self._frame = TableFrame(self)
+        try:
+            self._frame.choose(super().options())
+        except InputError:
+            self.destroy_node()
+            raise
         for name, kind in OUTPUT_TYPES.items():
             # Progress is not latched: a late subscriber has no use for an old one.
             self.offer(name, kind, latched=name != 'progress')
         self.session = CalibrationSession(self, self.types, make_simulator)
         self._inbox = Inbox()
-        self._working = False
+        self._working, self._waited = False, ''
         self._more = self.create_guard_condition(self._work)
         self.subscribe(*INPUT_TYPES)
         for name in ('start', 'stop', 'reset', 'discard_last'):
@@ -85,8 +93,14 @@ class CalibratorNode(GraphNode[Options]):
         self.session.drop(self._inbox.take_dropped())
         self.session.close()
 
+    def options(self) -> Options:
+        """Return the options in force; the pose of a named frame is looked up."""
+        return self._frame.applied(super().options())
+
     def changed(self, names: Sequence[str], options: Options) -> None:
-        """Log that new values have to wait, if a calibration is under way."""
+        """Log that new values have to wait, if a calibration is under way; take note of a named frame."""
+        if 'frame_pose' in names:
+            self._frame.choose(options)
         if self.session.calibrating:
             self.info(f'{", ".join(names)}: takes effect at the next start')
 
@@ -119,6 +133,8 @@ class CalibratorNode(GraphNode[Options]):
 
     def _work(self, seconds: float = SLICE) -> None:
         """Collect waiting messages for some time, and see to it that the others are collected soon."""
+        if not self._in_frame():
+            return
         self._working = True
         until = time.monotonic() + seconds
         try:
@@ -136,6 +152,25 @@ class CalibratorNode(GraphNode[Options]):
         self.session.behind = len(self._inbox) > 0
         if self.session.behind:
             self._more.trigger()
+
+    def _in_frame(self) -> bool:
+        """Tell whether messages can be read: they wait while the pose of their frame is missing."""
+        kind, octets = self._inbox.first
+        if not self._frame.missing or octets is None:
+            return True
+        try:
+            frame = self.decode(kind, octets).header.frame_id
+        except Exception:  # the session tells why
+            return True
+        words = self._frame.look_up(frame)
+        if self._frame.missing:
+            if words != self._waited:
+                self.refuse(words)
+            self._waited = words
+            return False
+        self.info(words)
+        self.session.take_options()
+        return True
 
     def _on_message_lost(self, kind: str, event: Any) -> None:
         if not self._inbox.numbered(kind):  # else the numbers tell it, and more
@@ -167,6 +202,8 @@ class CalibratorNode(GraphNode[Options]):
     def act(self) -> None:
         """Do what is due now."""
         self._after_jump()
+        if self._frame.missing and len(self._inbox):
+            self._work()
         self.session.drop(self._inbox.take_dropped())
         self.session.tick()
 

@@ -54,6 +54,11 @@ class Inbox:
             self._size -= len(octets) + OVERHEAD
         return kind, octets
 
+    @property
+    def first(self) -> tuple[str, bytes | None]:
+        """What `take` would return; ('', None) if nothing waits."""
+        return self._waiting[0] if self._waiting else ('', None)
+
     def drop(self, kind: str, count: int) -> None:
         """Count messages that were dropped."""
         if count:

@@ -151,6 +151,13 @@ class CalibrationSession:
             self._show()
         self._report()
 
+    def take_options(self) -> Options:
+        """Return the options in force, with which the messages so far are collected anew if they changed."""
+        options = self._graph.options()
+        if options != self._collected_with:
+            self._collector, self._collected_with = self._collector.with_options(options), options
+        return options
+
     def fail(self, text: str, *log: str) -> None:
         """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
         self._situation.state, self._situation.detail = 'failed', told(text)
@@ -222,9 +229,7 @@ class CalibrationSession:
     def _start(self) -> str:
         self._require_idle('~/start')
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
-        options = self._graph.options()
-        if options != self._collected_with:
-            self._collector, self._collected_with = self._collector.with_options(options), options
+        options = self.take_options()
         known = set(self._situation.refusals)
         for problem in self._collector.problems:
             if str(problem) not in known:

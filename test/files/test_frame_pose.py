@@ -69,6 +69,9 @@ def test_a_request_and_the_flag(tmp_path, seen, command):
     assert 'got a DLO' in wrong['problems'][0]
     _, right, _ = command('info', tmp_path / 'request.xml', '--json', '--frame-pose', TEXT)
     assert right['problems'] == []
+    code, _, errors = command('info', tmp_path / 'request.xml', '--frame-pose', 'table')
+    assert code == 2
+    assert 'only the node looks up' in errors[-1]
 
 
 def test_a_named_action_needs_a_frame_whose_z_is_up(seen):
@@ -82,7 +85,7 @@ def test_a_named_action_needs_a_frame_whose_z_is_up(seen):
         request_manipulations(request, Options(frame_pose=TEXT))
 
 
-@pytest.mark.parametrize('text', ['0 0 1', '0,0,1,0,0,0,1', 'table'])
+@pytest.mark.parametrize('text', ['0 0 1', '0,0,1,0,0,0,1', '7seven'])
 def test_what_is_neither_a_pose_nor_a_name_is_refused(text):
     with pytest.raises(InputError, match='frame_pose'):
         Options(frame_pose=text)

@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Where frame_pose names the table's frame, the node takes the pose from tf2, and messages wait for it."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+from live import live_node, robot_types
+import numpy as np
+import pytest
+from toy_messages import MINUTE, toy_trials, trial_messages
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.session import read_session
+from dlo_calibration.model.pose import Pose
+
+CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])
+
+
+class Buffer:
+    """The part of tf2_ros.Buffer that is used; it knows what a test puts into `known`."""
+
+    known = {}
+
+    def lookup_transform(self, target, source, _):
+        if (target, source) not in self.known:
+            raise LookupError(f'"{target}" passed to lookupTransform argument target_frame does not exist')
+        pose = self.known[target, source]
+        return SimpleNamespace(transform=SimpleNamespace(
+            translation=SimpleNamespace(**dict(zip('xyz', pose.position, strict=True))),
+            rotation=SimpleNamespace(**dict(zip('xyzw', pose.orientation, strict=True)))))
+
+
+@pytest.fixture
+def tf2(monkeypatch):
+    """Put a stand-in in place of tf2_ros, which is on no index; return what it knows."""
+    module = ModuleType('tf2_ros')
+    module.Buffer, module.TransformException = Buffer, LookupError
+    module.TransformListener = lambda buffer, node: None
+    monkeypatch.setattr(Buffer, 'known', {})
+    monkeypatch.setitem(sys.modules, 'tf2_ros', module)
+    return Buffer.known
+
+
+def test_messages_wait_for_the_transform_and_are_then_in_the_tables_frame(ros_environment, tmp_path, tf2):
+    with live_node(ros_environment, tmp_path, frame_pose='table') as robot:
+        trial = toy_trials(1)[0]
+        robot.send(trial_messages(robot_types(), CAMERA.inverse.trial(trial), MINUTE, 'camera'))
+        words = "no transform from 'camera' to 'table'"
+        robot.until(lambda: words in robot.status['last_refusal'], 'silence')
+        assert robot.status['trials'] == '0'
+        tf2['table', 'camera'] = CAMERA
+        robot.until_status(trials='1')
+        assert robot.call('start').success
+        robot.until_result()
+    session = read_session(next(tmp_path.glob('dlo_session_*')))
+    assert Pose.of(session.options.frame_pose).position.tolist() == CAMERA.position.tolist()
+    assert np.allclose(session.trials[0].initial.points, trial.initial.points, atol=1e-9)
+
+
+def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    with pytest.raises(InputError, match="got the name 'table', expected the numbers x y z .* not installed"):
+        with live_node(ros_environment, tmp_path, frame_pose='table'):
+            pass
