@@ -40,22 +40,19 @@ are too large together, those that no trial uses are forgotten; then further one
 from __future__ import annotations
 
 from bisect import bisect_right, insort
-from dataclasses import replace
 from itertools import pairwise
 from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL
+from dlo_calibration.messages.codec import ActionMessage, GOAL, INITIAL
+from dlo_calibration.messages.doubts import doubts
 from dlo_calibration.messages.manipulations import manipulation_of
-from dlo_calibration.messages.trial_builder import Key, Message, order, TrialBuilder
+from dlo_calibration.messages.trial_builder import Key, Message, moved, order, TrialBuilder
 from dlo_calibration.model.manipulation import Manipulation
-from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.plausibility import implausible
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
-DOUBTED = (-1, True)  # of a trial whose doubts were told
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
@@ -121,7 +118,7 @@ class TrialCollector:
         self._known[key] = message
         self._numbers += _size(message)
         if self.pose is not None:
-            message = _moved(message, self.pose)
+            message = moved(message, self.pose)
         last, without_start = self._builders[-1], len(self._builders) == 1
         if key > self._newest:
             self._newest = key
@@ -145,7 +142,7 @@ class TrialCollector:
             self._forget(KEPT // 2)
         if error is not None:
             raise error
-        self._doubt(self._place(key))
+        self._doubts += doubts(self._builders, self._place(key), self._options)
 
     def take_back(self) -> tuple[int, int]:
         """
@@ -233,25 +230,6 @@ class TrialCollector:
         """Return, once, what was found implausible about trials since the last call."""
         doubts, self._doubts = self._doubts, []
         return tuple(doubts)
-
-    def _doubt(self, k: int) -> None:
-        """Look whether a builder's trial is plausible, each time that its goals are twice as many."""
-        builder = self._builders[k] if k < len(self._builders) else None
-        if builder is None or not builder.complete or builder.judged == DOUBTED \
-                or builder.unsettled(self._options):
-            return
-        judged = len(builder.views).bit_length(), builder.judged[1] or builder.views[-1].stable
-        if judged == builder.judged:
-            return
-        builder.judged = judged
-        complete = [other for other in self._builders[:k + 1] if other.complete]
-        before = complete[-2].trial if len(complete) > 1 else None
-        trial, options = builder.build(f'trial {len(complete)}', self._options), self._options
-        height = options.table_height if options.table else None
-        found = implausible(trial, height, bool(options.scene), before)
-        if found:
-            builder.judged = DOUBTED
-            self._doubts += found
 
     def take_early(self) -> tuple[InputError, ...]:
         """Return, once, why goal chains that came before any action or initial chain are not used."""
@@ -386,14 +364,6 @@ class TrialCollector:
             else:
                 merged.append(span)
         self._forgotten = merged
-
-
-def _moved(message: Message, pose: Pose) -> Message:
-    """Return a message in another frame."""
-    if isinstance(message, ActionMessage):
-        return replace(message, positions=pose.points(message.positions),
-                       orientations=pose.orientations(message.orientations))
-    return ChainMessage(message.kind, message.stamp, message.frame_id, pose.chain(message.chain))
 
 
 def _size(message: Message) -> int:

@@ -16,6 +16,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, length_change
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.rest import Rest, STILL, STREAM, Stream
 
@@ -29,6 +30,14 @@ def order(message: Message) -> Key:
     """Return the key by which messages are sorted; it is unique among collected messages."""
     names = message.names if isinstance(message, ActionMessage) else ()
     return message.stamp, RANKS[message.kind], names
+
+
+def moved(message: Message, pose: Pose) -> Message:
+    """Return a message in another frame, in which its own has a pose."""
+    if isinstance(message, ActionMessage):
+        return replace(message, positions=pose.points(message.positions),
+                       orientations=pose.orientations(message.orientations))
+    return ChainMessage(message.kind, message.stamp, message.frame_id, pose.chain(message.chain))
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,7 @@ class TrialBuilder:
     waiting: list[Message] = field(default_factory=list)
     refused: list[tuple[Message, InputError]] = field(default_factory=list)
     trial: Trial | None = None
-    judged: tuple[int, bool] = (0, False)  # see `TrialCollector`
+    judged: tuple[int, bool] = (0, False)  # see `doubts`
     _stretches: list[Stretch] = field(default_factory=list)
 
     @property

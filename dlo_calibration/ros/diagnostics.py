@@ -71,6 +71,15 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
     return diagnostic_array(types, stamp, statuses)
 
 
+def in_one_line(found: CalibrationResult) -> str:
+    """Return the values, errors and end of a calibration as one line for the log."""
+    values = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
+                       f'{measured(one.physical_value, one.physical_unit)}'
+                       for name, one in found.parameters.items())
+    return (f'calibrated: {values}; score {found.best.score:.1f}, mean error '
+            f'{found.errors.mean * 1e3:.2f} mm; {found.stop_reason}')
+
+
 def _pairs(told: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     """Convert plain values for a message: lengths to mm, lists of texts to one text, None to ''."""
     pairs = {}

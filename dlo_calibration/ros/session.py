@@ -30,7 +30,6 @@ from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, r
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
-from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.report import sentences
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.graph import decoded, Graph, why
@@ -334,12 +333,8 @@ class CalibrationSession:
         calibration.situation.result = event
         if situation is not calibration.situation:
             situation.detail += '; this is the result of the session before the clock went back'
-        found = ', '.join(f'{name} {number(one.value)} ({interval(one.lower, one.upper, "1")}), '
-                          f'{measured(one.physical_value, one.physical_unit)}'
-                          for name, one in event.parameters.items())
         (self._graph.warn if event.usable else self._graph.info)(sentences.verdict(event))
-        self._graph.info(f'calibrated: {found}; score {event.best.score:.1f}, mean error '
-                         f'{event.errors.mean * 1e3:.2f} mm; {event.stop_reason}')
+        self._graph.info(diagnostics.in_one_line(event))
         for warning in event.warnings:
             self._graph.warn(warning)
         self._outlet.send('result', diagnostics.result(self._types, event, self._graph.stamp()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.time import Time
 
@@ -67,8 +68,8 @@ class TableFrame:
         try:
             found = self._buffer.lookup_transform(self._name, frame, Time()).transform
         except TransformException as error:
-            return (f'parameter frame_pose: got no transform from {frame!r} to {self._name!r}, expected one on '
-                    f'/tf or /tf_static; messages wait until it is there: publish it, or set the pose ({error})')
-        self.pose = Pose([found.translation.x, found.translation.y, found.translation.z],
-                         [found.rotation.x, found.rotation.y, found.rotation.z, found.rotation.w])
+            return (f'parameter frame_pose: got no transform from {frame!r} to {self._name!r}, expected one '
+                    f'on /tf or /tf_static; messages wait for it: publish it, or set the pose ({error})')
+        self.pose = Pose(np.array([found.translation.x, found.translation.y, found.translation.z]),
+                         np.array([found.rotation.x, found.rotation.y, found.rotation.z, found.rotation.w]))
         return f'{frame!r} is at {self.pose} in {self._name!r}, as tf2 tells: that is frame_pose'
