@@ -105,6 +105,17 @@ def test_requirements_are_those_of_setup():
         assert f"'{name}>={bound}'" in requirements
 
 
+def test_a_library_that_rosdep_does_not_install_is_told_in_one_line():
+    done = subprocess.run(
+        [sys.executable, '-c', "import sys; sys.modules['mcap'] = None\n"
+         'from dlo_calibration.__main__ import main; sys.exit(main())',
+         'info', ROOT / 'msg_samples' / 'object1'], capture_output=True, text=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])})
+    assert done.returncode == 2
+    assert 'pip install -r requirements.txt' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
 def test_bloom_takes_every_key():
     """It takes those that rosdep resolves to Debian packages; keys for pip end with -pip, but for a few."""
     for element in manifest().iter():

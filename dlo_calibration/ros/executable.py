@@ -36,8 +36,8 @@ def execute(program: str, purpose: str, load: Callable[[], Spin], args: Sequence
     except ImportError as error:
         if stop():  # an import that a signal disturbs may fail in any way
             return 0
-        sys.stderr.write(f'{program}: {error}; source a ROS 2 Jazzy installation, or, in the folder of '
-                         "dlo_calibration, install the libraries: pip install '.[ros]'\n")
+        sys.stderr.write(f'{program}: {error}; source a ROS 2 Jazzy installation, and install what README.md '
+                         'of the package names: rosdep install, and pip install -r requirements.txt\n')
         return 2
     finally:
         stop.ignore()
