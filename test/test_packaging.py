@@ -80,8 +80,8 @@ def test_what_is_imported_is_declared():
     keys = {element.text for element in manifest().iterfind('exec_depend')}
     requirements = (ROOT / 'setup.py').read_text(encoding='utf-8')
     distributions = packages_distributions()
-    # A ROS package has the name of its module, and is not for setup.py.
-    names = set(third_party_imports()) - keys
+    # A ROS package is not for setup.py; it has the name of its module, or that with _py.
+    names = {name for name in third_party_imports() if keys.isdisjoint({name, f'{name}_py'})}
     not_in_manifest = {name for name in names - OPTIONAL
                        if ROSDEP_KEYS.get(name, f'python3-{name}') not in keys
                        and FROM_PIP.get(name) not in from_pip()}
