@@ -91,8 +91,8 @@ class BulletRope:
         velocities = np.zeros((len(places), 3)) if velocities is None else velocities
         self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features,
                           directions)
+        self._held = ()
         self.release()
-        self.hold(())
         state = self._rope.state
         for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
             pybullet.changeDynamics(
