@@ -92,6 +92,10 @@ class Compiling:
         try:
             self._executor.submit(compile_kernels, self._module).result()
             self._news.put(f'the {KERNELS[self._module]} is compiled, after {time.monotonic() - begun:.0f} s')
+        except Exception as error:
+            if not self._closed:
+                self._news.put(f'the {KERNELS[self._module]} could not be compiled: {error}')
+            raise
         finally:
             with suppress(RuntimeError):
                 self._executor.close()

@@ -101,6 +101,8 @@ class PlannerSession:
     :param clock: a monotonic clock [s].
     """
 
+    status_period = 1.0  # s between two messages about no more than refusals
+
     def __init__(self, graph: Graph[PlannerOptions], types: MessageTypes, make_simulator: SimulatorFactory, *,
                  plan: PlanFunction = find_plan, processes: Processes | None = None,
                  clock: Callable[[], float] = time.monotonic) -> None:
@@ -119,6 +121,7 @@ class PlannerSession:
         self._state, self._detail, self._last_refusal = WAITING, '', ''
         self._refusals = Refusals()
         self._status: dict[str, Any] = {}  # content of the last message
+        self._told = float('-inf')  # when it was sent [s]
         self._progress: PlanProgress | None = None  # the newest, if it was not sent
         self._sent = float('-inf')  # when the last progress was sent [s]
         self._plan: Plan | None = None
@@ -327,8 +330,10 @@ class PlannerSession:
         content: dict[str, Any] = {
             'state': self._state, 'detail': detail, 'missing': missing, 'last_refusal': self._last_refusal,
             'description': self._origin, 'plans': self._plans}
-        if content != self._status:
-            self._status = content
+        changed = {name for name, value in content.items() if value != self._status.get(name, content)}
+        # A stream that is refused changes its count with each message.
+        if changed and (changed != {'last_refusal'} or self._clock() - self._told >= self.status_period):
+            self._status, self._told = content, self._clock()
             self._send('status', planner_status(self._types, stamp=self._graph.stamp(), plan=self._plan,
                                                 **content))
 

@@ -123,6 +123,18 @@ def test_a_goal_that_is_not_reached_is_a_warning_and_remarks_are_told(started):
     assert graph.logged['warn'] == ['The goal is 3 % longer than the DLO.']
 
 
+def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(started):
+    graph = started(ToyPlan())
+    graph.session.status_period, before = 1.0, len(graph.heard['status'])
+    for k in range(20):
+        graph.session.refuse(f'chain stamped {k} s: got nothing')
+        graph.session.tick()
+    assert len(graph.heard['status']) - before <= 1
+    graph.ahead += 1.0
+    graph.session.tick()
+    assert graph.status['last_refusal'].endswith(' (20 times)')
+
+
 def test_one_plan_at_a_time_and_stop_publishes_the_best_so_far(started):
     plan = ToyPlan(held=True)
     graph = started(plan)

@@ -70,6 +70,7 @@ class PlannerGraph(ToyNode):
         self.decoded = 0
         self.session = PlannerSession(self, TYPES, lambda _: None, plan=plan, processes=NoProcesses(),
                                       clock=self.clock)
+        self.session.status_period = 0.0
 
     def clock(self):
         return self.ahead
