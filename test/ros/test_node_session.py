@@ -208,7 +208,7 @@ def test_a_start_while_the_simulation_is_compiled_is_accepted_and_says_that_it_w
 def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
     graph = start(status_period=1.0)
     before = len(graph.heard['status'])
-    bad = with_point(4, float('nan'))(TYPES)
+    bad = with_point(4, float('inf'))(TYPES)
     for k in range(50):
         bad.header.stamp.sec = 200 + k
         graph.send([(GOAL, bad)])
