@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import argparse
+from multiprocessing import parent_process
 from signal import SIGINT
 import sys
 from typing import Any, NoReturn, Sequence
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import (
     capture,
     experiment,
@@ -27,6 +29,8 @@ from dlo_calibration.cli import (
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
+from dlo_calibration.simulation.kernel_cache import compile_kernels, is_compiled, KERNELS, SIMULATION
+from dlo_calibration.simulation.protocol import Simulator
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 #: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
@@ -35,7 +39,15 @@ VERBS = {'capture': capture, 'trace': trace, 'fit': fit, 'validate': validate, '
          'warm-up': warm_up}
 
 
-def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
+def make_told(options: Options) -> Simulator:
+    """Return the simulator that `options` name; tell before its kernels are compiled, which takes long."""
+    if parent_process() is None and not is_compiled(SIMULATION):
+        tell(f'compiling the {KERNELS[SIMULATION]} for this machine, once, about half a minute')
+        compile_kernels(SIMULATION)
+    return make_chosen_simulator(options)
+
+
+def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_told) -> int:
     """
     Execute a command line.
 

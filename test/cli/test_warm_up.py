@@ -3,7 +3,12 @@
 
 """The verb `warm-up`: what it says, and that a second time it has nothing to do."""
 
+from importlib import import_module
 from pathlib import Path
+
+from dlo_calibration.calibration.options import Options
+
+main = import_module('dlo_calibration.cli.main')
 
 
 def test_a_second_time_it_is_all_there(command):
@@ -13,3 +18,13 @@ def test_a_second_time_it_is_all_there(command):
         assert [one['name'] for one in found['compiled']] == ['simulation', 'tracer']
         assert all(list(Path(one['folder']).glob('*.nbi')) for one in found['compiled'])
     assert not any(one['compiled'] for one in found['compiled'])
+
+
+def test_a_verb_tells_that_it_compiles_before_it_does(monkeypatch, capsys):
+    done = []
+    monkeypatch.setattr(main, 'is_compiled', lambda module: bool(done))
+    monkeypatch.setattr(main, 'compile_kernels', lambda module: done.append(capsys.readouterr().err))
+    for _ in range(2):
+        main.make_told(Options()).close()
+    told, = done
+    assert told == 'compiling the simulation for this machine, once, about half a minute\n'
