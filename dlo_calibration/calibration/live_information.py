@@ -205,7 +205,7 @@ def _fingerprint(trial: Trial) -> bytes:
     pieces: list[Any] = [trial.initial.points.tobytes(),
                          b'' if trial.velocity is None else trial.velocity.tobytes()]
     for hand in trial.hands:
-        pieces += [hand.name, hand.grips, hand.times.tobytes(), hand.positions.tobytes(),
+        pieces += [hand.name, hand.grips, hand.offset, hand.times.tobytes(), hand.positions.tobytes(),
                    hand.orientations.tobytes()]
     pieces += [(goal.time, goal.stable, goal.held_by) for goal in trial.goals]
     return repr(pieces).encode()

@@ -62,7 +62,8 @@ def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
     chains = [trial.initial, *(goal.chain for goal in trial.goals)]
     return {
         'number': number, 'name': trial.name, 'points': len(trial.initial), 'length_m': trial.initial.length,
-        'hands': [{'name': hand.name, 'grips': list(hand.grips), 'waypoints': len(hand.times),
+        'hands': [{'name': hand.name, 'grips': list(hand.grips), 'offset': hand.offset,
+                   'waypoints': len(hand.times),
                    'start_s': hand.start, 'end_s': hand.end} for hand in trial.hands],
         'actions': len(trial.actions), 'goals': len(trial.goals),
         'stable_goals': sum(goal.stable for goal in trial.goals),

@@ -318,7 +318,7 @@ def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
         return
     paths = add(parent, PATHS)
     for hand in action.hands:
-        element = add(paths, 'hand', name=hand.name, grips=hand.grips)
+        element = add(paths, 'hand', name=hand.name, grips=hand.grips, offset=hand.offset or None)
         turns = (hand.orientations != NO_ROTATION).any(axis=1)
         for time, (x, y, z), turn, turned in zip(hand.times.tolist(), hand.positions.tolist(),
                                                  hand.orientations.tolist(), turns, strict=True):
@@ -376,7 +376,8 @@ def _hand(where: str, element: Any) -> Hand:
     try:
         return Hand(element.get('name'), tuple(int(one) for one in element.get('grips').split()),
                     np.array([number(where, waypoint, 'time') for waypoint in element]),
-                    read_vectors(where, element), np.array(turns, dtype=float))
+                    read_vectors(where, element), np.array(turns, dtype=float),
+                    finite(where, element, 'offset', element.get('offset', '0')))
     except InputError as error:
         raise _placed(where, element, error) from error
 

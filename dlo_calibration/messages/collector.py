@@ -18,7 +18,7 @@ does not order different topics, and a robot may publish an action only when it 
 - A hand grips the points that carry its number in the latest chain before the
   action.  In a goal chain, the number refers to the order of hands in the action
   before that goal; the name of that hand identifies it.  Without annotation, the
-  hand grips the point nearest to its first waypoint.
+  hand grips the DLO at the place nearest to its first waypoint, also between points.
 - A goal chain stamped while a hand moves, or before any hand has closed, is
   compared at that instant; any other with the DLO when it has come to rest.
 - A goal chain stamped before the first action of its trial waits unused, as

@@ -11,12 +11,14 @@ from typing import Sequence, Union
 
 import numpy as np
 
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.messages.trial_builder import order
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
 
+SAME_OFFSET = 1e-3  # of a segment
 BEFORE = NANOSECONDS // 100  # from the chain that gives a velocity to the initial chain
 
 
@@ -96,7 +98,8 @@ def _numbered(trial: Trial, groups: list[tuple[Hand, ...]]) -> tuple[list[tuple[
     """
     initial, first_goal = trial.initial, min(goal.time for goal in trial.goals)
     early = [hands for hands in groups if hands[0].start <= first_goal]
-    annotated = _annotated(initial, groups[0], [hand.name for hand in groups[0]])
+    annotated = _annotated(initial, groups[0], [hand.name for hand in groups[0]
+                                                if not hand.offset or not _tells_by_place(initial, hand)])
     if all(_tells(annotated, hands) for hands in early):
         return groups, annotated
     needed = Counter(hand.grips for hands in early for hand in hands if not _tells_by_place(initial, hand))
@@ -116,23 +119,24 @@ def _tells(chain: Chain, hands: Sequence[Hand]) -> bool:
     """Tell whether an annotated chain, and the places of the hands, give the points that hands grip."""
     for k, hand in enumerate(hands, start=1):
         held = np.flatnonzero(chain.hands == k)
-        if tuple(held.tolist()) != tuple(sorted(hand.grips)) if len(held) else \
+        if (tuple(held.tolist()) != tuple(sorted(hand.grips)) or hand.offset) if len(held) else \
                 not _tells_by_place(chain, hand):
             return False
     return True
 
 
 def _tells_by_place(chain: Chain, hand: Hand) -> bool:
-    """Tell whether a hand closes at the one point of a chain that it grips."""
-    distances = np.linalg.norm(chain.points - hand.positions[0], axis=1)
-    return hand.grips == (int(distances.argmin()),) and bool(distances.min() <= MINIMUM_SPACING)
+    """Tell whether a hand closes at the one place of a chain that it grips."""
+    point, offset, distance = chain.nearest(hand.positions[0])
+    return hand.grips == (point,) and abs(hand.offset - offset) < SAME_OFFSET and distance <= (
+        Options().grip_tolerance if hand.offset else MINIMUM_SPACING)
 
 
 def _at_rest(hand: Hand, start: float, end: float) -> Hand:
     """Return the path of a hand that stays at the last pose of `hand`."""
     times = [start, end] if end > start else [start]
     return Hand(hand.name, hand.grips, np.array(times), np.repeat(hand.positions[-1:], len(times), axis=0),
-                np.repeat(hand.orientations[-1:], len(times), axis=0))
+                np.repeat(hand.orientations[-1:], len(times), axis=0), hand.offset)
 
 
 def _annotated_goal(trial: Trial, goal: Goal, groups: Sequence[tuple[Hand, ...]]) -> Chain:

@@ -17,7 +17,7 @@ from dlo_calibration.messages.trial_builder import (
     seconds,
     TrialBuilder,
 )
-from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.action import Action
 from dlo_calibration.model.manipulation import in_steps, Manipulation, RecordedPaths, Timed
 
 
@@ -27,7 +27,7 @@ def manipulation_of(builder: TrialBuilder, name: str,
     Return what the hands of a trial did, whether or not it has a goal chain.
 
     A goal chain only tells which hands hold the DLO.  Without an annotation, a hand grips the nearest
-    point of the latest chain, if no action has moved the DLO since, else of the predicted chain.
+    place of the latest chain, if no action has moved the DLO since, else of the predicted chain.
 
     :param options: `grip_tolerance` and `release` are used.
     :returns: None if there is no usable action; and the reasons why actions are not used.
@@ -48,10 +48,7 @@ def manipulation_of(builder: TrialBuilder, name: str,
         if any(seen < end <= instants[0] for end in ends):
             action = _recorded(builder, message, float(seconds(instants, zero)[0]), options)
         elif order(message) in accepted:
-            action = Action(tuple(
-                Hand(hand, accepted[order(message)].grips[k], seconds(instants, zero),
-                     message.positions[:, k], message.orientations[:, k])
-                for k, hand in enumerate(message.names)))
+            action = accepted[order(message)].action(zero)
         if action is None:
             problems += [error for one, error in refused if one is message]
             continue

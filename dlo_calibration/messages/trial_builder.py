@@ -15,7 +15,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ACTION, ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain, Floats, length_change
+from dlo_calibration.model.chain import Chain, Floats, length_change, MINIMUM_SPACING
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.rest import Rest, STILL, STREAM, Stream
@@ -23,6 +23,7 @@ from dlo_calibration.observation.rest import Rest, STILL, STREAM, Stream
 Message = Union[ChainMessage, ActionMessage]
 Key = tuple[int, int, tuple[str, ...]]
 
+SAME = 0.1  # of a segment; two hands do not grip nearer to each other
 RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}  # order of messages with equal stamps
 
 
@@ -42,11 +43,19 @@ def moved(message: Message, pose: Pose) -> Message:
 
 @dataclass(frozen=True)
 class Move:
-    """A usable action: the points that each hand grips, and the instants of its waypoints [ns]."""
+    """A usable action: the grips and the offset of each hand, and the instants of its waypoints [ns]."""
 
     message: ActionMessage
     grips: tuple[tuple[int, ...], ...]
+    offsets: tuple[float, ...]
     instants: tuple[int, ...]
+
+    def action(self, zero: int) -> Action:
+        """Return the action, whose times count from `zero` [ns]."""
+        sent, times = self.message, seconds(self.instants, zero)
+        return Action(tuple(
+            Hand(name, self.grips[k], times, sent.positions[:, k], sent.orientations[:, k], self.offsets[k])
+            for k, name in enumerate(sent.names)))
 
 
 @dataclass(frozen=True)
@@ -202,23 +211,46 @@ class TrialBuilder:
             latest, numbered = self.views[-1].message, self.views[-1].names
         chain = latest.chain
         grips: list[tuple[int, ...]] = []
+        offsets: list[float] = []
         for name, position, held in zip(action.names, action.positions[0],
                                         annotated_grips(chain, numbered, action.names), strict=True):
-            if not held:
-                distances = np.linalg.norm(chain.points - position, axis=1)
-                held = (int(distances.argmin()),)
-                if distances.min() > options.grip_tolerance:
+            offset = self._offset(name, held)
+            if not held and (goes_on := self._goes_on(name, position, latest.stamp)) is not None:
+                held, offset = goes_on
+            elif not held:
+                point, offset, distance = chain.nearest(position)
+                held = (point,)
+                if distance > options.grip_tolerance:
                     raise InputError(
-                        str(action), f'{name} closing {distances.min():.4g} m from any point of {latest}',
+                        str(action), f'{name} closing {distance:.4g} m from any point of {latest}',
                         f'at most {options.grip_tolerance:g} m (grip_tolerance)',
                         'check the first waypoint, or number the gripped points in the field hand')
-            twice = {grip for other in grips for grip in other} & set(held)
+            twice = {grip for other, beside in zip(grips, offsets, strict=True) for grip in other
+                     if abs(beside - offset) < SAME} & set(held)
             if twice:
                 raise InputError(
                     str(action), f'two hands that grip point {min(twice)} of {latest}',
                     'different points', 'number the gripped points in the field hand, or leave one hand out')
             grips.append(held)
-        return Move(action, tuple(grips), instants_of(action))
+            offsets.append(offset)
+        return Move(action, tuple(grips), tuple(offsets), instants_of(action))
+
+    def _offset(self, name: str, held: tuple[int, ...]) -> float:
+        """Return the offset of a hand that holds points by annotation: that of its last grip of them."""
+        if not self.views or name not in self.views[-1].held_by:
+            return 0.0
+        last = [(move.grips[k], move.offsets[k]) for move in self.moves
+                for k, other in enumerate(move.message.names) if other == name]
+        return last[-1][1] if last and last[-1][0] == held else 0.0
+
+    def _goes_on(self, name: str, position: Floats, since: int) -> tuple[tuple[int, ...], float] | None:
+        """Return what a hand grips that goes on where its last action ended, later than `since` [ns]."""
+        for move in reversed(self.moves):
+            if name in move.message.names and move.instants[-1] > since:
+                k = move.message.names.index(name)
+                there = np.linalg.norm(move.message.positions[-1, k] - position) <= MINIMUM_SPACING
+                return (move.grips[k], move.offsets[k]) if there else None
+        return None
 
     def _view(self, goal: ChainMessage, options: Options) -> GoalView:
         start = self.starts[-1]
@@ -267,11 +299,7 @@ class TrialBuilder:
         zero = start.stamp
         if velocity is None:
             zero = min([self.views[0].message.stamp, *(move.instants[0] for move in self.moves)])
-        actions = tuple(
-            Action(tuple(Hand(hand, move.grips[k], seconds(move.instants, zero),
-                              move.message.positions[:, k], move.message.orientations[:, k])
-                         for k, hand in enumerate(move.message.names)))
-            for move in self.moves)
+        actions = tuple(move.action(zero) for move in self.moves)
         goals = tuple(goal for stretch in self._followed(options) for goal in stretch.goals(zero))
         return Trial(name, start.chain, actions, goals, velocity)
 

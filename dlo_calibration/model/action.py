@@ -44,6 +44,8 @@ class Hand:
     :param times: (k,) seconds since the start of the trial, increasing, k >= 1.
     :param positions: (k, 3) [m], at most `MAXIMUM_COORDINATE`.
     :param orientations: (k, 4) unit quaternions x y z w; None for no rotation.
+    :param offset: a pin between two points is so far beyond the gripped one, as a share of the way to the
+        next one, -1 to 1; negative: to the one before.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Hand:
     times: Floats
     positions: Floats
     orientations: Floats = None  # type: ignore[assignment]  # __post_init__ makes it an array
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         thing = f'hand {self.name!r}'
@@ -62,6 +65,9 @@ class Hand:
         if not self.grips:
             raise InputError(thing, 'no gripped point', 'at least one',
                              'name the points of the chain that it holds')
+        if not abs(self.offset) <= 1 or self.offset and len(self.grips) > 1:
+            raise InputError(thing, f'an offset of {self.offset:g} from {len(self.grips)} gripped point(s)',
+                             '-1 to 1 from one point', 'name the nearest point')
         if count == 0 or positions.shape != (count, 3) or orientations.shape != (count, 4):
             raise InputError(
                 thing, f'{count} times, positions {positions.shape}, orientations {orientations.shape}',

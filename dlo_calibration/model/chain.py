@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more, and squares must not overflow
 MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
+NEAR = 0.02  # of a segment; a hand that grips so near to a point grips that point
 SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
 
 
@@ -204,6 +205,41 @@ class Chain:
         at = np.interp(np.asarray(arc_lengths, dtype=float), along, parameters)
         return bezier_curve(self._knots(), self.points, at)
 
+    def nearest(self, position: Floats) -> tuple[int, float, float]:
+        """
+        Return the place of the curve that is nearest to a position, (3,) [m].
+
+        :returns: the nearest point to it along the curve and its offset from there, see `grip_place`, and its
+            distance from the position [m].
+        """
+        parameters, along = self._arc_length_table()
+        samples = bezier_curve(self._knots(), self.points, parameters)
+        steps = np.diff(samples, axis=0)
+        shares = np.clip(((position - samples[:-1]) * steps).sum(axis=1) / (steps**2).sum(axis=1), 0.0, 1.0)
+        away = np.linalg.norm(samples[:-1] + shares[:, None] * steps - position, axis=1)
+        k = int(away.argmin())
+        return *self.grip(float(along[k] + shares[k] * (along[k + 1] - along[k]))), float(away[k])
+
+    def grip(self, place: float) -> tuple[int, float]:
+        """
+        Return the point that is nearest to a place [m] along the curve, and the place's offset from there.
+
+        A place that is nearer to a point than NEAR is that point.
+        """
+        places = self.arc_lengths()
+        point = int(np.abs(places - place).argmin())
+        rest = min(max(place, 0.0), float(places[-1])) - float(places[point])
+        if not rest:
+            return point, 0.0
+        offset = rest / abs(float(places[point + (1 if rest > 0 else -1)] - places[point]))
+        return point, offset if abs(offset) > NEAR else 0.0
+
+    def gripped(self, grips: Sequence[int], offset: float) -> Floats:
+        """Return where a hand grips, (k, 3) [m]: `grips` are its points, see `grip_place` for the offset."""
+        if offset == 0:
+            return np.asarray(self.points[list(grips)])
+        return self.resample([grip_place(self.arc_lengths(), grip, offset) for grip in grips])
+
     @cached_property
     def _places(self) -> Floats:
         return frozen_array(self._arc_length_table()[1][::SAMPLES_PER_SEGMENT])
@@ -220,6 +256,18 @@ class Chain:
         samples = bezier_curve(knots, self.points, parameters)
         steps = np.linalg.norm(np.diff(samples, axis=0), axis=1)
         return parameters, np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def grip_place(places: Floats, point: int, offset: float) -> float:
+    """
+    Return the arc length [m] at which a hand grips, between two points.
+
+    :param places: (n,) arc lengths of the points [m].
+    :param offset: how far beyond the point it is, as a share of the way to the next one, at most 1; negative:
+        to the one before. The DLO ends at its last point.
+    """
+    beside = min(max(point + (1 if offset > 0 else -1), 0), len(places) - 1)
+    return float(places[point] + abs(offset) * (places[beside] - places[point]))
 
 
 def check_ends(thing: str, initial: Chain) -> None:

@@ -133,11 +133,11 @@ class RecordedPaths(NamedAction):
     Explicit paths of hands; where a hand grips can depend on the chain before.
 
     :param hands: their h names.
-    :param grips: for each hand, the points that it grips; empty: the one nearest to where it closes.
+    :param grips: for each hand, the points that it grips; empty: the place nearest to where it closes.
     :param times: (k,) [s] since `start`, increasing.
     :param positions: (k, h, 3) [m].
     :param orientations: (k, h, 4) quaternions x y z w.
-    :param tolerance: largest distance of a hand that closes from the nearest point [m].
+    :param tolerance: largest distance of a hand that closes from the nearest place [m].
     """
 
     hands: tuple[str, ...]
@@ -161,14 +161,15 @@ class RecordedPaths(NamedAction):
         """Return the paths, whose hands grip points of this chain."""
         found = []
         for k, (name, grips) in enumerate(zip(self.hands, self.grips, strict=True)):
+            offset = 0.0
             if not grips:
-                distances = np.linalg.norm(chain.points - self.positions[0, k], axis=1)
-                grips = (int(distances.argmin()),)
-                if distances.min() > self.tolerance:
+                point, offset, distance = chain.nearest(self.positions[0, k])
+                grips = (point,)
+                if distance > self.tolerance:
                     raise self._refused(
-                        f'{name} closing {distances.min():.4g} m from any point of the predicted chain',
+                        f'{name} closing {distance:.4g} m from any point of the predicted chain',
                         f'at most {self.tolerance:g} m (grip_tolerance)',
                         'check the first waypoint, or record the chain before this action')
             found.append(Hand(name, grips, self.start + self.times, self.positions[:, k],
-                              self.orientations[:, k]))
+                              self.orientations[:, k], offset))
         return Action(tuple(found))

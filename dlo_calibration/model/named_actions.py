@@ -10,7 +10,7 @@ speed.  With `hold` it keeps holding the DLO afterwards.
 
 The position of a hand [m] is that of the point that it grips.  This point is given
 as an index of the chain (negative: from its end), or as a fraction of the length,
-which selects the nearest point of the chain.  A target is given as coordinates,
+which may lie between two points of the chain.  A target is given as coordinates,
 or as a direction (of any length) and a distance.
 
 The docstring of each action tells how much it shows of each of the paper's four parameters.
@@ -94,17 +94,16 @@ class NamedAction:
         if (values[0] is None) == (values[1] is None):
             raise self._refused(f'{one} {values[0]}, {other} {values[1]}', 'one of the two', remedy)
 
-    def _grip(self, chain: Chain, point: int | None, fraction: float | None) -> int:
-        """Return the index, from 0, of the gripped point, given by an index or a fraction of the length."""
+    def _grip(self, chain: Chain, point: int | None, fraction: float | None) -> tuple[int, float]:
+        """Return the gripped point, from 0, and the offset from it; given by an index or by a fraction."""
         if point is not None:
             count = len(chain)
             if not -count <= point < count:
                 raise self._refused(f'point {point}', f'{-count} to {count - 1}', 'name a point of the chain')
-            return int(point) % count
+            return int(point) % count, 0.0
         if fraction is None or not 0 <= fraction <= 1:
             raise self._refused(f'fraction {fraction:g}', '0 to 1', 'give a fraction of the length')
-        along = chain.arc_lengths()
-        return int(np.abs(along - fraction * along[-1]).argmin())
+        return chain.grip(fraction * chain.length)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,14 +127,14 @@ class _OneHand(NamedAction):
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the path of the hand at constant speed, without repeated waypoints."""
-        grip = self._grip(chain, self.point, self.fraction)
-        way = [chain.points[grip]]
+        grip, offset = self._grip(chain, self.point, self.fraction)
+        way = [chain.gripped([grip], offset)[0]]
         for point in self._way(way[0]):
             if np.linalg.norm(point - way[-1]) > 1e-9 * self.speed:  # in 1 ns, times may round to one float
                 way.append(point)
         durations = np.linalg.norm(np.diff(way, axis=0), axis=1) / self.speed
         times = self.start + np.concatenate([[0.0], np.cumsum(durations)])
-        return Action((Hand(self.hand, (grip,), times, np.array(way)),))
+        return Action((Hand(self.hand, (grip,), times, np.array(way), offset=offset),))
 
     def _way(self, point: Floats) -> Sequence[Floats]:
         """Return the waypoints, (3,) [m] each, that follow the gripped point."""
@@ -325,9 +324,9 @@ class TwoHands(NamedAction):
         grips = [self._grip(chain, point, fraction) for point, fraction in zip(
             self.points or (None, None), self.fractions or (None, None), strict=True)]
         if grips[0] == grips[1]:
-            raise self._refused(f'both hands at point {grips[0]}', 'two different points',
+            raise self._refused(f'both hands at point {grips[0][0]}', 'two different points',
                                 'grip further apart')
-        begin = chain.points[grips]
+        begin = np.concatenate([chain.gripped([grip], offset) for grip, offset in grips])
         between = begin[1] - begin[0]
         gap = float(np.linalg.norm(between))
         if self.motion == 'together' and self.distance > gap:
@@ -344,8 +343,8 @@ class TwoHands(NamedAction):
             if length > 0:
                 way.append(target)
                 times.append(times[-1] + length / self.speed)
-        return Action(tuple(Hand(name, (grips[k],), np.array(times), np.array([one[k] for one in way]))
-                            for k, name in enumerate(self.hands)))
+        return Action(tuple(Hand(name, (grips[k][0],), np.array(times), np.array([one[k] for one in way]),
+                                 offset=grips[k][1]) for k, name in enumerate(self.hands)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,7 +382,7 @@ class Release(NamedAction):
                 raise self._refused(f'start {self.start:g} s, while hand {name!r} moves',
                                     f'{hand.end:g} s or later', 'let the hand arrive first')
             opened.append(Hand(name, hand.grips, np.array([self.start]), hand.positions[-1:],
-                               hand.orientations[-1:]))
+                               hand.orientations[-1:], hand.offset))
         return Action(tuple(opened))
 
 

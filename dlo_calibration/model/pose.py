@@ -112,4 +112,4 @@ class Pose:
 
     def _action(self, action: Action) -> Action:
         return Action(tuple(Hand(hand.name, hand.grips, hand.times, self.points(hand.positions),
-                                 self.orientations(hand.orientations)) for hand in action.hands))
+                                 self.orientations(hand.orientations), hand.offset) for hand in action.hands))

@@ -11,7 +11,7 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY, ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.noise import noise
@@ -166,7 +166,8 @@ def _may_stretch(trial: Trial, space: ParameterSpace, sigma: float) -> bool:
         for other in hands[k + 1:]:
             times = np.linspace(min(hand.start, other.start), max(hand.end, other.end), 4 * BETWEEN)
             apart = np.linalg.norm(hand.positions_at(times) - other.positions_at(times), axis=1).max()
-            if apart > 0.9 * np.ptp(places[[*hand.grips, *other.grips]]):  # else the DLO between is slack
+            grips = [grip_place(places, grip, one.offset) for one in (hand, other) for grip in one.grips]
+            if apart > 0.9 * np.ptp(grips):  # else the DLO between is slack
                 return True
     if np.isnan(sigma) or 'mass' in space.free or any(not goal.stable for goal in trial.goals):
         return True

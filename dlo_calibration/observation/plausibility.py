@@ -180,15 +180,15 @@ def _beside(rest: _Rest) -> float:
     The weight must have no moment about a pin, and none about the line through two pins: there is no friction
     that could balance it. 0 where a clamp or a third hand could.
     """
-    grips = [hand.grips[0] for hand in rest.hands if len(hand.grips) == 1]
+    grips = [rest.chain.gripped(hand.grips, hand.offset)[0] for hand in rest.hands if len(hand.grips) == 1]
     if len(grips) < len(rest.hands) or len(grips) > 2:
         return 0.0
     points = rest.chain.points
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     centre = steps @ (points[:-1] + points[1:]) / (2 * steps.sum())
-    down, lever = np.array([0.0, 0.0, -1.0]), centre - points[grips[0]]
+    down, lever = np.array([0.0, 0.0, -1.0]), centre - grips[0]
     if len(grips) == 2:
-        axis = points[grips[1]] - points[grips[0]]
+        axis = grips[1] - grips[0]
         axis /= np.linalg.norm(axis)
         down, lever = down - (down @ axis) * axis, lever - (lever @ axis) * axis
         if np.linalg.norm(down) < 0.5:  # an axis near the vertical leaves the direction open

@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_calibration.calibration.plain import known
 from dlo_calibration.model.action import Action, Hand, NO_ROTATION
-from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.chain import Chain, grip_place
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.prediction import PredictedStep, Prediction
 
@@ -65,7 +65,7 @@ def _hand(start: Chain, action: Action, hand: Hand) -> dict[str, Any]:
     """
     along = start.arc_lengths()
     values = {'name': hand.name, 'grip': hand.grips[0],
-              'grip_fraction': float(along[hand.grips[0]] / along[-1]),
+              'grip_fraction': grip_place(along, hand.grips[0], hand.offset) / float(along[-1]),
               'waypoints': np.column_stack([hand.times - action.start, hand.positions]).tolist()}
     if len(hand.grips) > 1:
         values['grips'] = list(hand.grips)

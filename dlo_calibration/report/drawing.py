@@ -16,7 +16,7 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Floats, grip_place
 from dlo_calibration.model.quantity import interval, measured, number
 from dlo_calibration.model.score import differences, PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
@@ -292,8 +292,9 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
             'error of a simulated point from the uncertainty of the parameters (one standard deviation)'))
     for hand in trial.hands:
         for k, grip in enumerate(hand.grips):
-            axes.axvline(places[grip], color=drawn.colours[hand.name], linestyle='--', linewidth=1,
-                         label=None if k else as_text(f'point that {hand.name} grips'))
+            axes.axvline(grip_place(places, grip, hand.offset), color=drawn.colours[hand.name],
+                         linestyle='--', linewidth=1,
+                         label=None if k else as_text(f'place that {hand.name} grips'))
     axes.set(xlabel='arc length from the first point [m]',
              ylabel='distance [mm]' if chains is None else 'distance from measured to simulated [mm]',
              title='how far each point moved' if chains is None else 'error of each point')

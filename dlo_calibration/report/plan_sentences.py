@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Floats, grip_place
 from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.model.score import SIMILAR
 from dlo_calibration.planning.plan import Plan
@@ -45,7 +45,8 @@ def _hand(plan: Plan, hand: Hand) -> str:
     rise = hand.positions[:, 2].max() - begin[2]
     way = f'lifts {number(100 * rise)} cm, carries' if rise > FLAT else 'drags'
     x, y = hand.positions[-1, :2]
-    return (f'{hand.name} grips at {places[hand.grips[0]] / places[-1]:.2f} of the length, {way} it to '
+    grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
+    return (f'{hand.name} grips at {grip:.2f} of the length, {way} it to '
             f'({x:.3f}, {y:.3f}) m and opens')
 
 

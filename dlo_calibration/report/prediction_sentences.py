@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.quantity import measured, number
 from dlo_calibration.planning.prediction import PredictedStep, Prediction
 from dlo_calibration.report.plan_sentences import FLAT
@@ -38,7 +38,8 @@ def _hand(start: Chain, hand: Hand, step: PredictedStep) -> str:
     if len(hand.times) == 1:
         return f'{hand.name} {after}'
     way = f'lifts {number(100 * rise)} cm, carries' if rise > FLAT else 'moves'
-    return (f'{hand.name} grips at {places[hand.grips[0]] / places[-1]:.2f} of the length, {way} it to '
+    grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
+    return (f'{hand.name} grips at {grip:.2f} of the length, {way} it to '
             f'{_place(hand.positions[-1])} m and {after}')
 
 

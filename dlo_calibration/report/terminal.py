@@ -227,8 +227,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
         head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'remarks')
         out.print(rows_table('trials', head, [
             (str(trial['number']), trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
-             ', '.join(f"{shortened(hand['name'], 100)} (points {' '.join(map(str, hand['grips']))})"
-                       for hand in trial['hands']),
+             ', '.join(f"{shortened(hand['name'], 100)} ({_grips(hand)})" for hand in trial['hands']),
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
              f"{number(trial['duration_s'])} s",
              ', '.join(word for word, there in (
@@ -239,3 +238,11 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     for title in ('refusals', 'problems'):
         for text in about[title]:
             out.print(escape(f'{title[:-1]}: {text}'))
+
+
+def _grips(hand: Mapping[str, Any]) -> str:
+    """Say where a hand grips."""
+    points, offset = hand['grips'], hand['offset']
+    if offset:
+        return f'between points {points[0] - (offset < 0)} and {points[0] + (offset > 0)}'
+    return f"points {' '.join(map(str, points))}"

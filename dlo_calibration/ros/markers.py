@@ -13,7 +13,7 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.action import Hand, NO_ROTATION
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.score import PointErrors, residuals
@@ -90,7 +90,7 @@ def _trial_markers(brush: Brush, trial: Trial, chains: Floats | None, k: int) ->
             yield from _error_markers(brush, goal, chain.points[chain.seen], chains[goal][chain.seen],
                                       trial.initial.length)
     for place, hand in enumerate(trial.hands[:MOST_HANDS]):
-        yield from hand_markers(brush, 3 * place, hand, trial.initial.points)
+        yield from hand_markers(brush, 3 * place, hand, trial.initial)
     text = trial.name
     if chains is not None:
         errors = PointErrors.of(residuals(trial, chains))
@@ -111,17 +111,17 @@ def _error_markers(brush: Brush, goal: int, points: Floats, simulated: Floats,
                        colours=[colour for colour in colours for _ in range(2)])
 
 
-def hand_markers(brush: Brush, first: int, hand: Hand, points: Floats) -> Iterator[Any]:
+def hand_markers(brush: Brush, first: int, hand: Hand, chain: Chain) -> Iterator[Any]:
     """
-    Show a hand's path, the points that it grips, and the place where it opens.
+    Show a hand's path, the places that it grips, and the place where it opens.
 
     :param first: number of the first of three markers of a hand: 0, 3, 6...; it chooses the colour.
-    :param points: (n, 3) [m] of the DLO when the hand closes.
+    :param chain: the DLO when the hand closes.
     """
     path, colour = hand_path(hand), HAND_COLOURS[first // 3 % len(HAND_COLOURS)]
     if np.ptp(path, axis=0).max() > 0:
         yield brush.line('hands', first, path, colour, 0.5)
-    yield brush.spheres('hands', first + 1, points[list(hand.grips)], [colour], 2.2)
+    yield brush.spheres('hands', first + 1, chain.gripped(hand.grips, hand.offset), [colour], 2.2)
     yield brush.marker('hands', first + 2, CUBE, at=path[-1], colours=[colour], scale=2.0)
 
 

@@ -10,7 +10,7 @@ from typing import Any, Iterator
 import numpy as np
 
 from dlo_calibration.messages.codec import MessageTypes
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.ros.markers import (
@@ -63,7 +63,7 @@ def _action_markers(brush: Brush, action: PlannedAction, before: Floats, k: int,
     yield brush.marker('interval', 0, LINE_LIST, points=_crosses(action), colours=[colour], scale=0.3,
                        group=6)
     for place, hand in enumerate(action.action.hands):
-        yield from hand_markers(brush, 3 * place, hand, before)
+        yield from hand_markers(brush, 3 * place, hand, Chain(before))
     place = action.action.hands[0].positions[0]
     yield brush.label('label', 0, place + [0.0, 0.0, 6 * brush.thickness], f'{k + 1}. {action.name}')
 

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Chain, Floats, frozen_array, interpolation_matrix
+from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place, interpolation_matrix
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.clamps import clamp_directions
 from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
+
+MERGED = 0.15  # of the mean distance of nodes
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class NodeLayout:
     Nodes of the simulated DLO.
 
     :param places: (N,) [m] arc lengths of the nodes at rest, from 0, increasing; every
-        gripped point has a node of its own.
+        place that a hand grips has a node of its own.
     :param points: (N, 3) [m] positions of the nodes at the start.
     :param velocities: (N, 3) [m/s] at the start.
     :param observe: (n, N) weights; multiplied by the nodes' positions they give the observed points.
@@ -44,7 +46,8 @@ class NodeLayout:
 
     def nodes(self, hand: Hand) -> tuple[int, ...]:
         """Return the nodes that a hand grips."""
-        return tuple(int(np.abs(self.places - self.point_places[grip]).argmin()) for grip in hand.grips)
+        return tuple(int(np.abs(self.places - grip_place(self.point_places, grip, hand.offset)).argmin())
+                     for grip in hand.grips)
 
     @classmethod
     def of(cls, trial: Trial, count: int) -> NodeLayout:
@@ -61,9 +64,9 @@ class NodeLayout:
         initial = _without_noise(trial)
         along = initial.arc_lengths()
         point_places = along if trial.places is None else trial.places
-        grips = sorted({grip for hand in trial.hands for grip in hand.grips})
-        fixed = np.unique(np.concatenate([[0.0], point_places[grips], point_places[-1:]]))
+        fixed = _fixed_places(trial, point_places, count)
         if len(fixed) > count:
+            grips = {(grip, hand.offset) for hand in trial.hands for grip in hand.grips}
             raise InputError(f'trial {trial.name!r}', f'{len(grips)} gripped points',
                              f'fewer than the {count} nodes', 'raise the number of nodes')
         rigid = np.isin(fixed[:-1], point_places[list(trial.clamped)])
@@ -78,6 +81,22 @@ class NodeLayout:
                      frozen_array(feature_shares(initial, start)), np.full((count - 1, 3), np.nan))
         return replace(layout, directions=frozen_array(clamp_directions(
             points, [(layout.nodes(hand), hand) for hand in trial.hands if hand.times[0] <= 0])))
+
+
+def _fixed_places(trial: Trial, places: Floats, count: int) -> Floats:
+    """
+    Return the arc lengths [m] at which nodes must lie: both ends, gripped points, and grips between points.
+
+    A grip between points that is nearer to another of them than MERGED shares its node: short segments would
+    be stiff, and a hand that grips anew at the same place does not close at exactly the same one.
+    """
+    points = [places[grip] for hand in trial.hands if not hand.offset for grip in hand.grips]
+    fixed = np.unique(np.concatenate([[0.0], points, places[-1:]]))
+    between = [hand for hand in trial.hands if hand.offset]
+    for place in sorted(grip_place(places, hand.grips[0], hand.offset) for hand in between):
+        if np.abs(fixed - place).min() > MERGED * places[-1] / (count - 1):
+            fixed = np.sort(np.append(fixed, place))
+    return fixed
 
 
 def feature_shares(chain: Chain, places: Floats) -> Floats:

@@ -41,12 +41,13 @@ def goal(at, **rest):
     return chain(GOAL, at, **rest)
 
 
-def action(at, times=(0.0, 1.0), names=('left_hand',), grips=(0,), away=0.0, frame='world', length=1.0):
-    """Hands that close `away` from points of a straight chain of 11, and rise."""
+def action(at, times=(0.0, 1.0), names=('left_hand',), grips=(0,), away=0.0, frame='world', length=1.0,
+           begin=0.0):
+    """Hands that close `away` from points of a straight chain of 11, and rise by 0.1 m from `begin`."""
     positions = np.zeros((len(times), len(names), 3))
     positions[:, :, 0] = np.array(grips) / 10 * length
     positions[:, :, 1] = away
-    positions[:, :, 2] = np.linspace(0, 0.1, len(times))[:, None]
+    positions[:, :, 2] = begin + np.linspace(0, 0.1, len(times))[:, None]
     orientations = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), len(names), 1))
     return ActionMessage(ns(at), frame, names, np.array(times), positions, orientations)
 
@@ -247,6 +248,24 @@ def test_hand_without_annotation_grips_the_nearest_point():
     hands = [1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]
     trial = only(initial(1, hands=hands), action(2, names=('a', 'b'), grips=(5, 6), away=0.019), goal(9))
     assert [hand.grips for hand in trial.hands] == [(0, 1), (6,)]
+
+
+def test_hand_without_annotation_grips_between_points_at_the_nearest_place():
+    trial = only(initial(1), action(2, names=('a', 'b'), grips=(5.3, 6.9), away=0.01), goal(9))
+    assert [hand.grips for hand in trial.hands] == [(5,), (7,)]
+    assert [hand.offset for hand in trial.hands] == pytest.approx([0.3, -0.1])
+
+
+def test_hand_that_goes_on_holding_stays_where_it_grips():
+    held = [0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
+    trial = only(initial(1), action(2, names=('a',), grips=(3.3,)), goal(4, hands=held),
+                 action(5, names=('a',), grips=(3.3,)), goal(9))
+    assert [a.hands[0].grips for a in trial.actions] == [(3,), (3,)]
+    assert [a.hands[0].offset for a in trial.actions] == pytest.approx([0.3, 0.3])
+    in_two = only(initial(1), action(2, names=('a',), grips=(3.3,), away=0.01),
+                  action(4, names=('a',), grips=(3.3,), away=0.01, begin=0.1), goal(9))
+    assert [(a.hands[0].grips, a.hands[0].offset) for a in in_two.actions] == 2 * [
+        ((3,), pytest.approx(0.3))]
 
 
 def test_hand_that_closes_too_far_away_is_refused():

@@ -41,6 +41,7 @@ def assert_same(found, trials):
         for b in other.hands:
             a, = (a for a in one.hands if a.name == b.name and abs(a.start - begin - b.start) < 3e-9)
             assert a.grips == b.grips
+            assert a.offset == pytest.approx(b.offset, abs=1e-3)
             assert a.end - begin == pytest.approx(b.end, abs=3e-9)
             np.testing.assert_allclose(a.positions_at(b.times + begin), b.positions, atol=1e-7)
         for a, b in zip(one.goals, other.goals, strict=True):
@@ -82,6 +83,11 @@ def moved(name, grip, start, to, begin=None):
 ASIDE = (0, 0.1, 0)
 
 
+def between(name, grip, offset, start):
+    begin, = Chain(POINTS).gripped((grip,), offset)
+    return Action((Hand(name, (grip,), [start, start + 1.0], [begin, begin + ASIDE], offset=offset),))
+
+
 @pytest.mark.parametrize('actions, held_by', [
     ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ()),
     ([moved('left', 0, 0, ASIDE), moved('left', 5, 3, ASIDE)], ()),
@@ -89,7 +95,10 @@ ASIDE = (0, 0.1, 0)
     ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ('left',)),
     ([moved('left', 0, 0, ASIDE), moved('right', 5, 3, ASIDE)], ('left', 'right')),
     ([moved('left', 0, 0, ASIDE), moved('a', 5, 3, ASIDE), moved('b', 2, 6, ASIDE)], ('left', 'a')),
-], ids=['two hands', 'one hand twice', 'one point twice', 'the first holds', 'both hold', 'three hands'])
+    ([between('left', 2, 0.3, 0), moved('right', 5, 3, ASIDE)], ('left', 'right')),
+    ([moved('right', 5, 0, ASIDE), between('left', 2, -0.4, 3)], ()),
+], ids=['two hands', 'one hand twice', 'one point twice', 'the first holds', 'both hold', 'three hands',
+        'one between points holds', 'one between points'])
 def test_actions_after_each_other_without_a_goal_between_keep_their_grips(actions, held_by):
     goal = Goal(Chain(POINTS + ASIDE), 8.0, True, held_by)
     trial = Trial('in turn', Chain(POINTS), tuple(actions), (goal,))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dlo_calibration import Chain, Goal, Hand, InputError
-from dlo_calibration.model.chain import bezier_curve, interpolation_matrix
+from dlo_calibration.model.chain import bezier_curve, grip_place, interpolation_matrix
 
 LINE = np.array([[0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
 
@@ -211,3 +211,16 @@ def test_half_of_the_points_are_enough():
     points[2] = np.nan
     with pytest.raises(InputError, match='3 of 8 points that were seen.*at least 4 that were seen.*hidden'):
         Chain(points)
+
+
+@pytest.mark.parametrize('place', [0.0, 0.31, 0.487, 1.2, 1.5])
+def test_the_place_nearest_to_a_position_lies_between_points(place):
+    turn = np.linspace(0, 1.5, 13)
+    chain = Chain(np.stack([np.sin(turn), 1 - np.cos(turn), np.zeros(13)], axis=1))
+    at = np.array([np.sin(place), 1 - np.cos(place), 0.0])
+    point, offset, distance = chain.nearest(at + [0, 0, 0.02])
+    assert point == np.abs(turn - place).argmin()
+    assert distance == pytest.approx(0.02, abs=1e-4)
+    assert grip_place(chain.arc_lengths(), point, offset) == pytest.approx(place, abs=4e-3)
+    np.testing.assert_allclose(chain.gripped((point,), offset)[0], at, atol=4e-3)
+    assert chain.nearest(chain.points[4]) == (4, 0.0, pytest.approx(0.0, abs=1e-12))

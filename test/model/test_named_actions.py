@@ -13,7 +13,7 @@ import pytest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.chain import Chain, grip_place
 from dlo_calibration.model.named_actions import (
     Drag,
     GraspAndPlace,
@@ -76,8 +76,12 @@ def test_lift_goes_up_and_push_goes_down():
 
 
 @pytest.mark.parametrize('fraction, grip', [(0, 0), (0.25, 2), (0.5, 4), (0.7, 4), (0.8, 5), (1, 5)])
-def test_fraction_grips_the_point_nearest_to_it_along_the_length(fraction, grip):
-    assert only_hand(LiftAndHold(fraction=fraction)).grips == (grip,)
+def test_fraction_grips_there_also_between_points(fraction, grip):
+    hand = only_hand(LiftAndHold(fraction=fraction))
+    assert hand.grips == (grip,)
+    place = grip_place(CHAIN.arc_lengths(), grip, hand.offset)
+    assert place == pytest.approx(fraction * CHAIN.length, abs=3e-3)
+    np.testing.assert_allclose(hand.positions[0], CHAIN.resample([place])[0], atol=1e-9)
 
 
 @pytest.mark.parametrize('motion, moving, ends', [

@@ -170,3 +170,12 @@ def test_points_that_were_not_seen_have_no_spheres(types):
     spheres, line = shown(types, [replace(trial, goals=goals)])['trial_1/goal']
     assert np.array_equal(points(spheres), np.delete(trial.goals[0].chain.points, [2, 5], axis=0))
     assert len(line.points) == len(hidden)
+
+
+def test_hand_that_grips_between_points_is_shown_there(types):
+    trial, = toy_trials(1)
+    hand = replace(trial.hands[0], grips=(3,), offset=0.25)
+    trial = replace(trial, actions=(replace(trial.actions[0], hands=(hand,)),))
+    grip = shown(types, [trial])['trial_1/hands'][1]
+    expected = trial.initial.points[3] + 0.25 * (trial.initial.points[4] - trial.initial.points[3])
+    assert np.allclose(points(grip), expected, atol=2e-3)

@@ -64,6 +64,27 @@ def test_a_clamp_that_holds_from_the_start_has_no_node_within(first, count):
     assert free.max() < 2.1 * free.min() + 1e-9 or count < 20
 
 
+def test_a_grip_between_points_has_a_node_there():
+    def gripping(*places):
+        hands = [Hand(f'hand {k}', (point,), [0.0, 1.0], np.zeros((2, 3)), offset=offset)
+                 for k, (point, offset) in enumerate(places)]
+        return Trial('t', Chain(arc()), (Action(hands),), (Goal(Chain(arc()), 2.0),))
+
+    one = gripping((4, 0.4), (13, -0.3))
+    layout = NodeLayout.of(one, 30)
+    along = Chain(arc()).arc_lengths()
+    expected = [along[4] + 0.4 * (along[5] - along[4]), along[13] - 0.3 * (along[13] - along[12])]
+    nodes = [node for hand in one.hands for node in layout.nodes(hand)]
+    assert layout.places[nodes] == pytest.approx(expected, abs=1e-12)
+    assert layout.points[nodes] == pytest.approx(Chain(arc()).resample(expected), abs=1e-9)
+    near = gripping((4, 0.4), (4, 0.41), (20, -0.02))  # gripped anew, and at the end
+    layout = NodeLayout.of(near, 30)
+    assert np.diff(layout.places).min() > 0.5 * np.diff(layout.places).max()
+    first, second, end = (layout.nodes(hand) for hand in near.hands)
+    assert first == second
+    assert end == (29,)
+
+
 def test_points_between_those_that_a_hand_grips_keep_their_nodes():
     one = trial(arc(), ((2, 6),))
     a, b = NodeLayout.of(one, 61).nodes(one.hands[0])

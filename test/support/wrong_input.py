@@ -247,7 +247,8 @@ WRONG = [
             "'world' as in the first message", 'send all chains and actions in one frame')
       for kind, make in ((INITIAL, cloud), (ACTION, action), (GOAL, cloud))),
     # actions
-    Wrong('grips nothing', ACTION, action(away=0.05), 'left_hand closing 0.05 m from any point of goal_chain',
+    Wrong('grips nothing', ACTION, action(away=0.05),
+          'left_hand closing 0.0458 m from any point of goal_chain',
           'at most 0.02 m (grip_tolerance)', 'check the first waypoint'),
     Wrong('two hands, one point', ACTION,
           action(names=('a', 'b'), spoil=lambda m: setattr(m.points[0], 'transforms',
