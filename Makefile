@@ -82,7 +82,7 @@ figures: bench
 	$(PYTHON) benchmark/worth.py --output build/experiment >/dev/null
 	cp build/experiment/worth.md benchmark/results/worth.md
 	cp build/experiment/worth.png doc/worth.png
-	for name in from_photographs $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
+	for name in from_photographs live_information $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
 
 clean:
 	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -26,22 +26,15 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.evaluation.processes import ProcessExecutor
-from dlo_calibration.inference.trial_information import (
-    Posterior,
-    posterior,
-    simulated_information,
-    TrialInformation,
-    without_repeated_goals,
-)
-from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.inference.appraiser import Appraiser, Knowledge, without_repeated_goals
+from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.noise import noise
 from dlo_calibration.observation.plausibility import implausible
 from dlo_calibration.observation.rest_lengths import with_shared_places
-from dlo_calibration.simulation.protocol import Simulator
 
-#: fingerprint -> (d, d) information of a trial, or why there is none, in words
-_Known = dict[tuple[bytes, int], Union[Floats, str]]
+#: fingerprints -> what is known after these trials; or why the last one tells nothing, in words
+_Known = dict[tuple[tuple[bytes, int], ...], Union[Knowledge, str]]
 
 
 class _Job:
@@ -133,14 +126,16 @@ class LiveInformation:
                   result: CalibrationResult | None, informations: _Known) -> None:
         space, height = options.space, options.table_height if options.table else None
         trials = with_shared_places(trials)
-        best = None if result is None else result.best.point
         examination = None if result is None else result.examination
         done = fingerprints(result.trials) if result and examination and examination.regular else []
-        new = [(trial, key) for trial, key in zip(trials, fingerprints(trials), strict=True)
-               if key not in done]
+        keys = fingerprints(trials)
+        new = [(trial, tuple(keys[:k + 1])) for k, trial in enumerate(trials) if keys[k] not in done]
         if all(key in informations for _, key in new):
             return
-        known, length = posterior(trials, space, height, best, examination), mean_length(trials)
+        known, kept = Knowledge.before(trials, space, height), []
+        if result is not None and done and examination is not None:
+            known = Knowledge(known.names, result.best.point, examination.uncertainty)
+            kept = list(result.trials)
         with (closing(self._make_simulator(options)) as simulator,
               closing(ProcessExecutor(1, answer_limit=options.answer_limit)) as process):
             for trial, key in new:
@@ -150,8 +145,9 @@ class LiveInformation:
                     informations[key] = doubts[0]
                 elif fresh:
                     try:
-                        informations[key] = _result(job, process.submit(
-                            _simulated, trial, known, space, simulator, length, height))
+                        informations[key] = _result(job, process.submit(_appraised, Appraiser(
+                            space, simulator, mean_length(trials), height, noise(trials)), known,
+                            [*kept, trial]))
                     except CancelledError:
                         raise
                     except Exception as error:  # of the engine, or because the process died
@@ -160,17 +156,17 @@ class LiveInformation:
                 if isinstance(found, str):
                     added = TrialInformation.unknown(trial.name, known.names, found)
                 else:
-                    after = known.after(found)
-                    added, known = TrialInformation(trial.name, known.names, known.std, after.std), after
+                    added = TrialInformation(trial.name, known.names, known.uncertainty.std,
+                                             found.uncertainty.std, found.uncertainty.verdicts)
+                    known, kept = found, [*kept, trial]
                 if fresh:
                     job.found.put(added)
 
 
-def _simulated(trial: Trial, known: Posterior, space: ParameterSpace, simulator: Simulator, length: float,
-               table_height: float | None) -> Floats:
-    """Return the (d, d) information of a trial; called in the process."""
-    with closing(simulator):
-        return simulated_information(trial, known, space, simulator, length, table_height)
+def _appraised(appraiser: Appraiser, known: Knowledge, trials: Sequence[Trial]) -> Knowledge:
+    """Return what is known after the last trial; called in the process."""
+    with closing(appraiser.simulator):
+        return appraiser.after(known, trials)
 
 
 def _result(job: _Job, future: Future[Any]) -> Any:

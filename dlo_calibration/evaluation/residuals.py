@@ -88,6 +88,11 @@ class ResidualLayout:
         groups = np.array_split(np.arange(len(rows)), min(len(rows), most))
         return [slice(rows[group[0]].start, rows[group[-1]].stop) for group in groups]
 
+    def aligned(self, values: Floats) -> list[Floats]:
+        """Split (m, ...) values by trial; those of goal, point and coordinate, with 0 at unseen points."""
+        return [np.nan_to_num(self._spread(k, values[rows].reshape(-1, 3, *values.shape[1:]))).reshape(
+            -1, *values.shape[1:]) for k, rows in enumerate(self.rows)]
+
     def chains(self, residuals: Floats) -> list[Floats]:
         """Split (m,) residuals [m] into one array (goals, points, 3) [m] per trial; NaN at unseen points."""
         return [self._spread(k, residuals[rows].reshape(-1, 3)).reshape(*shape, 3)

@@ -109,7 +109,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     count += len(drawn)
     found = at_minimum(fit, layout, noise=noise, shift=shift,
                        starts=[one for one in drawn if one is not None])
-    found = _extended(fit, found, residuals_at, fading)
+    found = extended(fit, found, residuals_at, fading)
     assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
@@ -150,7 +150,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
     return Linearisation(point, residuals, jacobian)
 
 
-def _extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
+def extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
               fading: NDArray[np.bool_]) -> Uncertainty:
     """
     Return intervals that are extended to where the residuals really change as much as the linear fit says.

@@ -221,7 +221,7 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
 
 def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
     """Return the indices of T trials in groups that show the same: their derivatives are nearly parallel."""
-    sides = [fit.jacobian[rows].ravel() for rows in layout.rows]
+    sides = [block.ravel() for block in layout.aligned(fit.jacobian)]
     sizes = [max(float(np.linalg.norm(side)), TINY) for side in sides]
     groups: list[list[int]] = []
     for k, side in enumerate(sides):
@@ -241,9 +241,9 @@ def shared_error(residuals: Floats, layout: ResidualLayout, groups: Sequence[Seq
     It is the mean correlation of their residuals (m,) [m], as far as it is positive: 1 for a trial that is
     repeated to the digit, near 0 where the model is right and only the noise is new each time.
     """
-    shared = np.eye(len(layout.shapes))
+    shared, blocks = np.eye(len(layout.shapes)), layout.aligned(residuals)
     for group in groups:
-        each = np.stack([residuals[layout.rows[k]] for k in group])
+        each = np.stack([blocks[k] for k in group])
         power, count = float(np.square(each).sum()), len(group)
         if count > 1 and power > 0:
             both = float(np.square(each.sum(axis=0)).sum()) - power  # of all pairs, either way
@@ -263,7 +263,7 @@ def shared_information(fit: Linearisation, layout: ResidualLayout, shared: Float
     alone = fit.information
     if np.count_nonzero(shared) == len(shared):
         return alone
-    gradients = together([fit.jacobian[rows] for rows in layout.rows], shared)
+    gradients = together(layout.aligned(fit.jacobian), shared)
     return np.asarray(alone @ np.linalg.pinv(gradients, hermitian=True) @ alone)
 
 

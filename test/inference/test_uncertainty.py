@@ -188,6 +188,16 @@ def test_a_repeat_averages_its_noise_and_not_the_error_of_the_model():
     assert again.verdicts == wrong.verdicts
 
 
+def test_repeats_of_which_not_all_points_were_seen_share_their_error():
+    generator = np.random.default_rng(14)
+    residuals = generator.normal(0, 1e-3, (2, 120)) + generator.normal(0, 3e-3, (1, 120))
+    fit, whole = repeated(residuals, 2), ResidualLayout(((1, 40),) * 2)
+    layout = ResidualLayout(((1, 40),) * 2, ((3,), (8, 9)))
+    rows = np.delete(np.arange(240).reshape(80, 3), [3, 48, 49], axis=0).ravel()
+    partly = at_minimum(fit.rows(rows), layout, noise=1e-3)
+    assert partly.std == pytest.approx(at_minimum(fit, whole, noise=1e-3).std, rel=0.1)
+
+
 def test_nine_of_ten_intervals_contain_the_truth_where_repeats_share_the_error_of_the_model():
     jacobian, inside = repeated(np.zeros((4, 120))).jacobian, []
     for seed in range(200):

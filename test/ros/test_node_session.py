@@ -460,7 +460,7 @@ def test_status_says_whether_a_trial_added_information(start, tmp_path, command)
     graph.send(trial_messages(TYPES, toy_trials(1)[0], 2 * MINUTE))  # the same again
     graph.ahead += 1.0
     graph.until(lambda: graph.status['last_trial'].startswith('trial 2'))
-    assert graph.status['last_trial'] == 'trial 2 adds nothing new: repeat it only to average noise'
+    assert graph.status['last_trial'].startswith('trial 2 adds nothing new: repeat it only to average noise')
     live = graph.calibrated()
     folder, = folders(tmp_path)
     assert score(command, folder) == whole(live)['score']
