@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 from typing import Callable, Mapping, Sequence, TYPE_CHECKING
@@ -29,6 +29,7 @@ from dlo_calibration.report.figure import (
     BLUE,
     FAINT,
     GREEN,
+    MOST_TICKS,
     OBSERVED,
     Panel,
     panel,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99')
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a square, in turn
+SAME_PLACE = 0.005  # of the length: mean distance up to which two goals show the same rest
 INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # of goals in motion, early to late
 
 
@@ -72,18 +74,41 @@ class Drawn:
     def of(cls, result: CalibrationResult, k: int) -> Drawn:
         """Return the k-th trial of a result."""
         trial, found = result.trials[k], result.examination
-        band = None
-        if found is not None and found.regular:
-            by_goal = ResidualLayout.of(result.trials).by_point(found.band)[k]
-            band = np.fmax.reduce(by_goal[shown_goals(len(trial.goals))], axis=0)
-        return cls(trial, result.chains[k], hand_colours([trial]), math.nan if found is None else found.noise,
-                   band)
+        drawn = cls(trial, result.chains[k], hand_colours([trial]),
+                    math.nan if found is None else found.noise)
+        if found is None or not found.regular:
+            return drawn
+        by_goal = ResidualLayout.of(result.trials).by_point(found.band)[k]
+        return replace(drawn, band=np.fmax.reduce(by_goal[drawn._shown()], axis=0))
 
     def goals(self) -> list[tuple[int, str | None]]:
         """Return the indices of the goals to show, with a colour for each if there are several."""
-        goals = shown_goals(len(self.trial.goals))
+        goals = self._shown()
         return [(goal, INSTANT_COLOURS[order] if len(goals) > 1 else None)
                 for order, goal in enumerate(goals)]
+
+    def _shown(self) -> list[int]:
+        """
+        Choose at most five goals: the last, and those with the largest errors.
+
+        Of goals that show the same rest, and of those of a stream that are seen at about the same time, only
+        one is chosen. Where nothing was simulated, they are spread over the trial.
+        """
+        goals = self.trial.goals
+        points, times = np.stack([goal.chain.points for goal in goals]), [goal.time for goal in goals]
+        most = len(INSTANT_COLOURS)
+        apart = (times[-1] - times[0]) / (2 * most) if len(goals) > most else 0.0
+        order = np.array(shown_goals(len(goals)))
+        if self.chains is not None:
+            seen = np.stack([goal.chain.observed for goal in goals])
+            order = np.argsort(-np.nanmean(np.linalg.norm(seen - self.chains, axis=2), axis=1), kind='stable')
+        chosen = [len(goals) - 1]
+        for k in map(int, order):
+            away = np.linalg.norm(points[chosen] - points[k], axis=2).mean(axis=1)
+            if len(chosen) < most and away.min() > SAME_PLACE * self.trial.initial.length \
+                    and min(abs(times[k] - times[one]) for one in chosen) >= apart:
+                chosen.append(k)
+        return sorted(chosen)
 
 
 def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, path: str | Path) -> None:
@@ -195,6 +220,7 @@ class View:
             axes.set(title='seen from the side', xlabel=f'{where} [m]', ylabel='z (up) [m]')
         axes.set_aspect('equal', adjustable='datalim')
         axes.margins(0.12)
+        axes.locator_params(axis='x', nbins=MOST_TICKS)
         axes.grid(alpha=0.3)
 
     def flat(self, points: Floats) -> Floats:
@@ -296,8 +322,8 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
                          linestyle='--', linewidth=1,
                          label=None if k else as_text(f'place that {hand.name} grips'))
     axes.set(xlabel='arc length from the first point [m]',
-             ylabel='distance [mm]' if chains is None else 'distance from measured to simulated [mm]',
-             title='how far each point moved' if chains is None else 'error of each point')
+             ylabel='distance [mm]',
+             title='how far each point moved' if chains is None else 'distance from measured to simulated')
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
 
@@ -316,8 +342,8 @@ def _draw_differences(axes: Axes, drawn: Drawn) -> None:
             ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
         axes.plot(places, values * 1e3, color=colour, linestyle=dashes, linewidth=1.8, label=f'in {axis}')
     last = '' if len(trial.goals) == 1 else f', after {number(goal.time)} s'
-    axes.set(xlabel='arc length from the first point [m]', ylabel='difference [mm]',
-             title=f'residuals: simulated minus measured{last}')
+    axes.set(xlabel='arc length from the first point [m]', ylabel='simulated minus measured [mm]',
+             title=f'residuals{last}')
     axes.grid(alpha=0.3)
 
 

@@ -25,11 +25,13 @@ BLUE, GREEN, PURPLE, SKY, YELLOW = '#0072b2', '#009e73', '#cc79a7', '#56b4e9', '
 OBSERVED, SIMULATED, BEFORE, FAINT = 'black', '#d55e00', '0.72', '0.45'
 BAND = '#f7d9c4'  # a light tint of SIMULATED
 WIDTH, HEIGHT = 4.8, 3.5  # in, of a panel of the page: it stays readable on a phone
+MOST_TICKS = 5  # intervals along a panel: of more, long numbers would touch each other
 BAR_ROOM = 0.8  # in, for a colour bar beside the axes
 #: Matplotlib's settings belong to the process, and its fonts are not thread-safe.
 _LOCK = threading.Lock()
 SETTINGS: Any = {'svg.hashsalt': 'dlo_calibration', 'svg.fonttype': 'none', 'axes.spines.top': False,
-                 'axes.spines.right': False, 'axes.titley': 1.0, 'axes.axisbelow': True}
+                 'axes.spines.right': False, 'axes.titley': 1.0, 'axes.labelpad': 7.0,
+                 'axes.formatter.useoffset': False, 'axes.axisbelow': True}
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Pane
         figure = blank_figure(WIDTH, HEIGHT, layout=None)
         axes = figure.add_axes((0, 0, 1, 1))
         draw(axes)
+        axes.locator_params(axis='x', nbins=MOST_TICKS)
         handles, labels = axes.get_legend_handles_labels()
         labels = [textwrap.fill(label, 64) for label in labels]
         lines = sum(1 + label.count('\n') for label in labels) if legend else 0
@@ -65,6 +68,10 @@ def panel(draw: Callable[[Axes], None], words: str, legend: bool = True) -> Pane
         if lines:
             figure.legend(handles, labels, loc='lower left', bbox_to_anchor=(0.02, 0), frameon=False,
                           fontsize=9, labelspacing=0.35)
+        reach = axes.yaxis.get_tightbbox(figure.canvas.get_renderer())  # type: ignore[attr-defined]
+        if reach is not None and reach.x0 < 0.03 * figure.dpi:  # wide numbers push the label out
+            box, more = axes.get_position(), 0.03 / WIDTH - reach.x0 / (WIDTH * figure.dpi)
+            axes.set_position((box.x0 + more, box.y0, box.width - more, box.height))
         octets = io.BytesIO()
         figure.savefig(octets, format='svg', metadata={'Date': None})
     return Panel(f'data:image/svg+xml;base64,{base64.b64encode(octets.getvalue()).decode()}', words)

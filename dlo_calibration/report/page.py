@@ -28,7 +28,7 @@ from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_pan
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
 from dlo_calibration.report.rows import parameter_rows
-from dlo_calibration.report.sentences import MEAN_DISTANCE, sentences, verdict
+from dlo_calibration.report.sentences import lower_score, MEAN_DISTANCE, sentences, verdict
 from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.writing import whole
 
@@ -106,7 +106,7 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
         correlated=most_correlated(values['correlations']),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
-        **drawn, lowest_score=min(one.score for one in result.evaluations),
+        **drawn, lower_score=lower_score(result),
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
         versions={name: _version(name) for name in

@@ -29,7 +29,7 @@ def sentences(result: CalibrationResult) -> list[str]:
     """Return sentences on the parameters and their uncertainty, the next action, and how well the fit is."""
     return [*_known(result), *rest_shape_sentences(result), *friction_sentences(result),
             *_undetermined(result), *_uninformative(result), *_advice(result), *_fit(result),
-            *_missing_parameters(result)]
+            *filter(None, [lower_score(result)]), *_missing_parameters(result)]
 
 
 def _known(result: CalibrationResult) -> list[str]:
@@ -103,6 +103,17 @@ def _fit(result: CalibrationResult) -> list[str]:
             'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
             'the rest comes from errors of the model or of the recorded hands.'))
     return [' '.join(words)]
+
+
+def lower_score(result: CalibrationResult) -> str:
+    """Say why the result is not the evaluation with the lowest difference score; empty if it is."""
+    lowest, best = min(result.evaluations, key=lambda one: one.score), result.best
+    if lowest.score >= best.score or number(lowest.score) == number(best.score):
+        return ''
+    return (f'Evaluation {lowest.index + 1} has a lower difference score than the result, '
+            f'{number(lowest.score)} instead of {number(best.score)} cm: the search minimises the distances '
+            'of all points, with less weight on outliers, while in the score differences of opposite sign '
+            'cancel.')
 
 
 def _missing_parameters(result: CalibrationResult) -> list[str]:

@@ -16,7 +16,7 @@ from toy_messages import toy_trials
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.animation import write_animation
-from dlo_calibration.report.drawing import session_picture, View
+from dlo_calibration.report.drawing import Drawn, hand_colours, session_picture, trial_panels, View
 from dlo_calibration.report.figure import blank_figure, SIMULATED
 from dlo_calibration.simulation.motion import densely, MOST_FRAMES, simulated_motion
 from dlo_calibration.simulation.protocol import Rollout
@@ -109,6 +109,61 @@ def test_few_goals_are_shown_the_last_always(count):
     assert chosen[-1] == count - 1
     assert len(chosen) == min(count, 5)
     assert chosen == sorted(set(chosen))
+
+
+def stream(rest=100, moving=100):
+    """Return a trial of a stream of goals, first in motion and then at rest, and chains that are off once."""
+    trial = tracked(1)
+    chain = trial.goals[0].chain
+    goals = [Goal(Chain(chain.points + (0, 0, 0.01 * max(moving - k, 0))), 5 + 0.03 * k, stable=k >= moving)
+             for k in range(moving + rest)]
+    trial = replace(trial, goals=tuple(goals))
+    off = np.exp(-0.5 * ((np.arange(moving + rest) - 40) / 5) ** 2)
+    return trial, chains_of(trial) + 0.1 * off[:, None, None]
+
+
+def test_of_a_stream_the_largest_error_is_drawn_and_a_rest_only_once():
+    trial, chains = stream()
+    shown = [goal for goal, _ in Drawn(trial, chains, {}).goals()]
+    assert 40 in shown  # the largest error
+    assert shown[-1] == len(trial.goals) - 1
+    assert len(shown) == 5
+    assert sum(trial.goals[k].stable for k in shown) == 1
+    times = [trial.goals[k].time for k in shown]
+    assert np.diff(times).min() > 0.5  # not five times the same instant
+
+
+def test_few_goals_are_all_drawn_unless_they_are_the_same_rest():
+    trial, _ = stream(rest=1, moving=4)
+    assert [goal for goal, _ in Drawn(trial, chains_of(trial, 0.01), {}).goals()] == [0, 1, 2, 3, 4]
+    trial, _ = stream(rest=4, moving=0)
+    assert [goal for goal, _ in Drawn(trial, chains_of(trial, 0.01), {}).goals()] == [3]
+
+
+@pytest.mark.parametrize('shift, scale', [(0.0, 1.0), (1000.0, 1.0), (0.0, 0.03)])
+def test_labels_stand_beside_numbers_and_in_the_picture(shift, scale, monkeypatch):
+    trial = tracked(3)
+    trial = replace(
+        trial, initial=Chain(trial.initial.points * scale + shift), actions=tuple(replace(action, hands=tuple(
+            replace(hand, positions=hand.positions * scale + shift) for hand in action.hands))
+            for action in trial.actions),
+        goals=tuple(replace(goal, chain=Chain(goal.chain.points * scale + shift)) for goal in trial.goals))
+    figures = []
+    monkeypatch.setattr('matplotlib.figure.Figure.savefig', lambda figure, *_, **__: figures.append(figure))
+    trial_panels(Drawn(trial, chains_of(trial, 1e-5), hand_colours([trial])))
+    assert len(figures) == 4
+    for figure in figures:
+        figure.draw_without_rendering()
+        axes, whole = figure.axes[0], figure.bbox
+        boxes = [axes.title.get_window_extent()]
+        for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            assert axis.get_offset_text().get_text() == ''
+            numbers = zip(axis.get_ticklabels(), axis.get_ticklocs(), strict=True)
+            boxes += [axis.label.get_window_extent(), *(
+                label.get_window_extent() for label, place in numbers if min(limits) <= place <= max(limits))]
+        for k, box in enumerate(boxes):
+            assert min(box.x0, box.y0, whole.x1 - box.x1, whole.y1 - box.y1) > -1
+            assert not any(box.overlaps(other) for other in boxes[:k])
 
 
 class Following:

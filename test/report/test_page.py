@@ -243,7 +243,9 @@ def framed(page: str, sizes: Mapping[int, int]) -> str:
     :param sizes: height of the frame of each width.
     """
     measure = ("let seen = this.contentDocument.documentElement; document.body.append("
-               "'measured in ' + this.width + ': ' + seen.scrollWidth + ' ' + seen.scrollHeight + '; ')")
+               "'measured in ' + this.width + ': ' + seen.scrollWidth + ' ' + seen.scrollHeight + '; ');"
+               "for (let one of seen.querySelectorAll('.good, .weak, .bad')) document.body.append("
+               "'verdict in ' + this.width + ': ' + Math.ceil(one.getBoundingClientRect().right) + '; ')")
     frames = (f'<iframe style="border:0; vertical-align:top" width="{width}" height="{height}" '
               f'onload="{measure}" srcdoc="{escape(page)}"></iframe>' for width, height in sizes.items())
     return f'<!DOCTYPE html><body style="margin:0; white-space:nowrap">{"".join(frames)}</body>'
@@ -264,6 +266,9 @@ def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path):
         across, heights[width] = needed(document, width)
         assert across <= width
         assert heights[width] > 3000
+        verdicts = [int(right) for right in re.findall(rf'verdict in {width}: (\d+);', document)]
+        assert len(verdicts) >= 4
+        assert max(verdicts) <= width  # no verdict must be scrolled to
     frame.write_text(framed(drawn, heights), encoding='utf-8')
     browse(f'--screenshot={shot}', f'--window-size={sum(WIDTHS)},{max(heights.values())}', frame.as_uri())
     whole, left = np.asarray(Image.open(shot).convert('L')), 0

@@ -94,6 +94,20 @@ def test_fit_is_compared_with_noise(result):
     assert 'noise' not in last(float('nan'))
 
 
+def test_a_lower_score_elsewhere_is_explained_in_one_sentence(result):
+    def told(score):
+        other = replace(result.evaluations[0], index=6, scores=(score,))
+        return [text for text in sentences(replace(result, evaluations=(other, result.best)))
+                if 'lower difference score' in text]
+
+    best = replace(result.best, scores=(4.83,))
+    result = replace(result, best=best)
+    assert told(5.0) == told(4.829) == []  # people do not see a difference
+    text, = told(4.5)
+    assert text.startswith('Evaluation 7 has a lower difference score')
+    assert '4.5 instead of 4.83 cm' in text
+
+
 def test_search_that_did_not_arrive_is_told(result):
     told = sentences(replace(result, examination=replace(result.examination, regular=False)))
     assert any('has not reached a minimum' in text for text in told)
