@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 from typing import Iterable, Mapping, Sequence
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, meant
 
 
 def check_arguments(file: str, known: Sequence[str], words: Sequence[str] | None = None) -> None:
@@ -27,8 +27,8 @@ def check_arguments(file: str, known: Sequence[str], words: Sequence[str] | None
         name, given, _ = word.partition(':=')
         if given and name not in known:
             raise InputError(f'{Path(file).name}', f'the argument {name}', f'one of {", ".join(known)}',
-                             'for another parameter, change a copy of the parameter file, and give it as '
-                             'params_file')
+                             meant(name, known, 'for another parameter, change a copy of the parameter '
+                                   'file, and give it as params_file'))
 
 
 def check_rviz(wanted: str) -> None:

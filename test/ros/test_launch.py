@@ -144,6 +144,9 @@ def test_launch_refuses_an_argument_that_it_does_not_know_and_lists_the_others(n
     monkeypatch.setattr(sys, 'argv', [*command, 'tabel_height:=0.7'])
     with pytest.raises(InputError, match='argument tabel_height, expected one of params_file, .*goal_chain'):
         launched(node, monkeypatch)
+    monkeypatch.setattr(sys, 'argv', [*command, 'namspace:=left'])
+    with pytest.raises(InputError, match=r'did you mean namespace\?'):
+        launched(node, monkeypatch)
     # The arguments of another launch file, which includes this one, are its own.
     monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', 'cell', 'cell.launch.py', 'robot:=left'])
     launched(node, monkeypatch)
