@@ -34,9 +34,9 @@ import numpy as np
 from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import MultiThreadedExecutor
-from rclpy.time import Time
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -46,7 +46,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / 'examples'))
-from robot_session import action, chain, LATCHED, values  # noqa: E402 - an example shows how to send messages
+from robot_session import action, FRAME, LATCHED, values  # noqa: E402 - an example shows how to send messages
 
 NODE = '/calibrator'
 RATE = 30.0  # 1/s, of the tracker
@@ -60,50 +60,69 @@ ACTIONS = (  # place of the grip along the rope, 0..1; way of the hand [m]: up, 
     (0.0, (0.10, 0.20)), (0.5, (0.15, -0.18)), (1.0, (-0.25, 0.12)), (0.25, (0.05, 0.22)))
 
 
+def cloud(points, stamp):
+    """Return the message of a tracker, which does not know about hands."""
+    message = PointCloud2(height=1, width=len(points), point_step=12, row_step=12 * len(points),
+                          is_dense=True)
+    message.header.frame_id, message.header.stamp = FRAME, stamp.to_msg()
+    message.fields = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+                      for k, name in enumerate('xyz')]
+    message.data = np.asarray(points, '<f4').tobytes()
+    return message
+
+
 class Rope:
-    """A simulated rope on a table; it remembers where it was at each instant."""
+    """A simulated rope on a table, and where it is at each instant of the day."""
 
     def __init__(self) -> None:
         along = np.linspace(-0.5, 0.5, NODES)
         curve = np.stack([0.6 * along, 0.04 * np.sin(5 * along), 0 * along], axis=1)
-        self.length = Chain(curve).length
-        self.physical = ParameterSpace(mass=MASS).physical(TRUTH, self.length)
-        self.points = curve + (0.0, 0.0, self.physical['self_collision'])
+        length = Chain(curve).length
+        self.physical = ParameterSpace(mass=MASS).physical(TRUTH, length)
         options = Options(mass=MASS, nodes=(NODES + 1) // 2, engine='compiled')
         self.simulator = make_simulator(options).refined()
-        self.times, self.movie = [0.0], [self.points]
+        self.times = [0.0]
+        self.movie = [curve + (0.0, 0.0, self.physical['self_collision'])]
+        self.scenes = []
+        points = self.movie[0]
+        for place, way in ACTIONS:
+            self.scenes.append(self.scene(points, round(place * (NODES - 1)), way))
+            points = self.scenes[-1][-1][-1]
 
-    def at(self, now: float) -> np.ndarray:
+    def scene(self, points, grip, aside):
+        """Return times and places of the hand, and instants and points of the rope, in an action."""
+        x, y = aside
+        times = np.array([0.0, 0.5, 1.7, 2.2])
+        way = points[grip] + np.array([(0, 0, 0), (0, 0, 0.06), (x, y, 0.06), (x, y, 0.0)])
+        start, hand = Chain(points), Hand('hand', (grip,), times, way)
+        instants = np.arange(1, round((times[-1] + SWING) * 100)) / 100
+        goals = tuple(Goal(start, float(t), stable=False, held_by=('hand',) if t < times[-1] else ())
+                      for t in instants)
+        trial = Trial('the day', start, (Action((hand,)),), goals)
+        return times, way, instants, self.simulator.simulate(trial, self.physical).chains
+
+    def at(self, now: float):
         """Return the (n, 3) [m] points that a perfect tracker sees at a time [s]."""
         return self.movie[max(bisect_right(self.times, now) - 1, 0)][::SEEN]
 
-    def act(self, number: int, now: float) -> tuple[list[tuple[float, np.ndarray]], float]:
-        """Let the hand act from a time [s]; return its waypoints, and how long the rope needs to rest [s]."""
-        place, (x, y) = ACTIONS[number]
-        grip = round(place * (NODES - 1))
-        way = self.points[grip] + np.array([(0, 0, 0), (0, 0, 0.06), (x, y, 0.06), (x, y, 0.0)])
-        times = np.array([0.0, 0.5, 1.7, 2.2])
-        start = Chain(self.points)
-        instants = np.arange(1, round((times[-1] + SWING) * RATE)) / RATE
-        goals = tuple(Goal(start, float(t), stable=False, held_by=('hand',) if t < times[-1] else ())
-                      for t in instants)
-        trial = Trial('the day', start, (Action((Hand('hand', (grip,), times, way),)),), goals)
-        shown = self.simulator.simulate(trial, self.physical).chains
-        self.times += (now + instants).tolist()
+    def act(self, number: int, begin: float):
+        """Let the hand act from a time [s] on; return times and places of its way."""
+        times, way, instants, shown = self.scenes[number]
         self.movie += list(shown)
-        self.points = shown[-1]
-        return list(zip(times.tolist(), way, strict=True)), float(times[-1] + SWING)
+        self.times += (begin + instants).tolist()
+        return times, way
 
 
 class Day:
     """Tracker, hand and user: what they send, and what they are told."""
 
     def __init__(self, minutes: float) -> None:
-        self.rope, self.begun, self.minutes = Rope(), time.monotonic(), minutes
+        self.rope, self.minutes = Rope(), minutes
         self.generator = np.random.default_rng(0)
         self.told: list[tuple[float, str, str]] = []
         self.slowest, self.answers, self.heard, self.over = 0.0, 0, {}, False
         self.node = rclpy.create_node('day')
+        self.begun, self.dawn = time.monotonic(), self.node.get_clock().now()
         self.initial = self.node.create_publisher(PointCloud2, f'{NODE}/initial_chain', 10)
         self.goal = self.node.create_publisher(PointCloud2, f'{NODE}/goal_chain', 10)
         self.hands = self.node.create_publisher(MultiDOFJointTrajectory, f'{NODE}/action', 10)
@@ -143,14 +162,16 @@ class Day:
         if message.name.endswith('calibrator'):
             self.tell('log', message.msg)
 
-    def seen(self) -> np.ndarray:
-        """Return what the tracker sees now, in its own frame."""
-        points = self.rope.at(self.now)
-        return points + self.generator.normal(0, NOISE, points.shape) + (0.0, 0.0, LIFTED)
-
     def track(self) -> None:
-        """Publish a cloud."""
-        self.goal.publish(chain(self.seen(), self.node.get_clock().now()))
+        """Publish what the tracker sees now, in its own frame."""
+        self.goal.publish(self.look())
+
+    def look(self):
+        """Return what the tracker sees now."""
+        stamp = self.node.get_clock().now()
+        points = self.rope.at((stamp - self.dawn).nanoseconds / 1e9)
+        seen = points + self.generator.normal(0, NOISE, points.shape) + (0.0, 0.0, LIFTED)
+        return cloud(seen, stamp)
 
     def probe(self) -> None:
         """Call a service again and again; keep the longest wait for an answer."""
@@ -181,14 +202,13 @@ class Day:
 
     def move(self, number: int) -> None:
         """Send the chain before an action, move the rope, and wait until it rests."""
-        self.initial.publish(chain(self.seen(), self.node.get_clock().now()))
-        time.sleep(0.2)
-        begun, stamp = self.now, self.node.get_clock().now()
-        waypoints, rest = self.rope.act(number, begun)
-        self.hands.publish(action([(t, place + (0.0, 0.0, LIFTED)) for t, place in waypoints],
-                                  Time(nanoseconds=stamp.nanoseconds, clock_type=stamp.clock_type)))
+        self.initial.publish(self.look())
+        stamp = self.node.get_clock().now() + Duration(seconds=0.5)
+        begin = (stamp - self.dawn).nanoseconds / 1e9
+        times, way = self.rope.act(number, begin)
+        self.hands.publish(action([(times, way + (0.0, 0.0, LIFTED))], stamp))
         self.tell('robot', f'action {number + 1}')
-        self.wait(begun + rest)
+        self.wait(begin + times[-1] + SWING)
 
     def wait(self, until: float) -> None:
         """Sleep until a time [s] of the day."""

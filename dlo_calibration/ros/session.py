@@ -26,7 +26,7 @@ from dlo_calibration.evaluation.compiling import Compiling
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import description_document
-from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, MessageTypes, read
+from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
@@ -93,13 +93,15 @@ class CalibrationSession:
                         'it belongs to the former session')
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
-        if kind != INITIAL:
+        if kind == INITIAL:
+            self.take_options()
+        else:
             self._situation.heard = self._clock()
             self._situation.markers.wanted = self._situation.appraisal.wanted = True
         problem = problem if message is None else self._collect(message)
         if problem:
             self.refuse(problem)
-        elif not self.calibrating:
+        elif not self.calibrating and (self._situation.state != 'done' or kind != GOAL):  # a tracker goes on
             self._situation.state, self._situation.detail = 'collecting', ''
 
     def drop(self, counts: Mapping[str, int]) -> None:

@@ -265,6 +265,18 @@ def test_goals_of_a_tracker_before_the_first_initial_chain_are_counted_and_no_re
     assert told.endswith('and 4 more: came before the first initial chain; not used')
 
 
+def test_a_tracker_that_goes_on_leaves_the_state_done(start):
+    graph = start(evaluations=3)
+    graph.send(session_messages(TYPES, 1))
+    graph.calibrated()
+    goal = session_messages(TYPES, 1)[2][1]
+    goal.header.stamp.sec += 5
+    graph.send([(GOAL, goal)])
+    assert graph.status['state'] == 'done'
+    graph.send(session_messages(TYPES, 1, first=1)[:1])
+    graph.until(lambda: graph.status['state'] == 'collecting')
+
+
 def test_starts_by_itself_once_the_last_trial_is_quiet_and_only_once(start):
     graph = start(start_after_trials=2)
     graph.send(session_messages(TYPES, 2))
