@@ -132,6 +132,8 @@ def _wrong_place(rest: _Rest, table_height: float | None, scene: bool,
     aside = _beside(rest)
     if aside <= BESIDE:
         return None
+    if table_height is not None and np.ptp(z) <= max(RESTING_BAND, 2 * margin):
+        return _in_the_air(level, table_height)
     return (f'whose centre of mass is {math.degrees(aside):.0f} degrees from straight below the hands',
             'it below them', 'set frame_pose so that z is up, number all points that a hand grips in the '
             'field hand, or correct table_height')

@@ -58,7 +58,7 @@ class CalibratorNode(GraphNode[Options]):
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
         super().__init__('calibrator', Options, INPUT_TYPES, **arguments)
-        self._frame = TableFrame(self)
+        self._frame, self._changed = TableFrame(self), False
         try:
             self._frame.choose(super().options())
         except InputError:
@@ -101,6 +101,7 @@ class CalibratorNode(GraphNode[Options]):
         """Log that new values have to wait, if a calibration is under way; take note of a named frame."""
         if 'frame_pose' in names:
             self._frame.choose(options)
+        self._changed = True
         if self.session.calibrating:
             self.info(f'{", ".join(names)}: takes effect at the next start')
 
@@ -204,6 +205,9 @@ class CalibratorNode(GraphNode[Options]):
         self._after_jump()
         if self._frame.missing and len(self._inbox):
             self._work()
+        if self._changed:  # what comes next is judged with the new values
+            self._changed = False
+            self.session.take_options()
         self.session.drop(self._inbox.take_dropped())
         self.session.tick()
 

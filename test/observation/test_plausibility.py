@@ -84,6 +84,13 @@ def test_wrong_frame_or_unit_is_told_with_its_remedy(lying, change, words):
         assert word in text
 
 
+def test_a_level_dlo_in_the_air_with_a_hand_at_its_end_lies_where_no_table_is(lying):
+    first = moved(lying[0], (0, 0, 0.75))
+    timed = replace(first, goals=(replace(first.goals[0], stable=False),))
+    text, = implausible(timed, 0.0)
+    assert 'begins at rest 754 mm above the table' in text
+
+
 def test_the_same_frame_is_right_where_the_table_is_said_to_be_there(lying):
     assert implausible_trials([moved(trial, (3.0, -2.0, 0.75)) for trial in lying], 0.75) == ()
 

@@ -64,3 +64,17 @@ def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path
     with pytest.raises(InputError, match="got the name 'table', expected the numbers x y z .* not installed"):
         with live_node(ros_environment, tmp_path, frame_pose='table'):
             pass
+
+
+def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path):
+    from rclpy.parameter import Parameter
+
+    with live_node(ros_environment, tmp_path) as robot:
+        lifted = [Pose([0.0, 0.0, 0.75], [0.0, 0.0, 0.0, 1.0]).trial(trial) for trial in toy_trials(2)]
+        robot.send(trial_messages(robot_types(), lifted[0], MINUTE))
+        robot.until(lambda: 'trial 1: got a DLO' in robot.status['last_refusal'], 'silence')
+        answer, = robot.calibrator.set_parameters([Parameter('table_height', value=0.75)])
+        assert answer.successful
+        robot.send(trial_messages(robot_types(), lifted[1], 2 * MINUTE))
+        robot.until_status(trials='2')
+        assert 'trial 2' not in robot.status['last_refusal']
