@@ -93,9 +93,7 @@ class CalibrationSession:
                         'it belongs to the former session')
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
-        if kind == INITIAL:
-            self.take_options()
-        else:
+        if kind != INITIAL:
             self._situation.heard = self._clock()
             self._situation.markers.wanted = self._situation.appraisal.wanted = True
         problem = problem if message is None else self._collect(message)

@@ -195,7 +195,7 @@ def test_a_start_while_the_simulation_is_compiled_is_accepted_and_says_that_it_w
     monkeypatch.setattr(compiling, 'compile_kernels', compile_slowly)
     graph = start()
     graph.until(lambda: 'compiling the simulation' in graph.status['detail'])
-    assert any('compiling the simulation' in text for text in graph.logged['info'])
+    graph.until(lambda: any('compiling the simulation' in text for text in graph.logged['info']))
     graph.send(session_messages(TYPES, 1))
     done, answer = graph.session.request('start')
     assert done and 'begins when the simulation is compiled' in answer
