@@ -45,7 +45,7 @@ from typing import Iterable
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ActionMessage, GOAL, INITIAL
+from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.messages.doubts import doubts
 from dlo_calibration.messages.manipulations import manipulation_of
 from dlo_calibration.messages.trial_builder import Key, Message, moved, order, TrialBuilder
@@ -53,6 +53,7 @@ from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
+LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
 MOST_NUMBERS = 20_000_000  # coordinates in them, which take 160 MB
 
@@ -98,6 +99,7 @@ class TrialCollector:
                 pass  # it is among `other.problems`
         for one in gone:
             other._leave_out(one)
+        other._early = []  # they were told
         for begin, end in self._forgotten:
             other._close(begin, end)
         return other
@@ -290,7 +292,10 @@ class TrialCollector:
         self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._builders[begin:end])
         self._builders[begin:end] = folded
         if begin == 0 and len(self._builders) > 1 and order(message) < self._builders[1].first:
-            return self._no_start(message)
+            error = self._no_start(message)
+            if message.kind == ACTION or self._builders[1].first[0] - message.stamp > LATE:
+                return error
+            self._early.append(error)  # of a tracker that was on before, and slower than the initial chain
         return found
 
     def _no_start(self, message: Message, more: int = 0) -> InputError:

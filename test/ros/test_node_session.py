@@ -260,8 +260,12 @@ def test_goals_of_a_tracker_before_the_first_initial_chain_are_counted_and_no_re
         goal.header.stamp.sec = seconds - 40 + k
         graph.send([(GOAL, goal)])
     graph.send(session_messages(TYPES, 1))
+    goal.header.stamp.sec = session_messages(TYPES, 1)[0][1].header.stamp.sec - 1
+    goal.header.stamp.nanosec = 900_000_000  # it comes later than the initial chain
+    graph.send([(GOAL, goal)])
     assert (graph.status['last_refusal'], graph.status['trials']) == ('', '1')
-    told, = (text for text in graph.logged['info'] if text.startswith('goal_chain'))
+    told, late = (text for text in graph.logged['info'] if text.startswith('goal_chain'))
+    assert late.endswith('s: came before the first initial chain; not used')
     assert told.endswith('and 4 more: came before the first initial chain; not used')
 
 
