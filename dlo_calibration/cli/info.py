@@ -67,6 +67,7 @@ def _about_trial(number: int, trial: Trial) -> dict[str, Any]:
                    'start_s': hand.start, 'end_s': hand.end} for hand in trial.hands],
         'actions': len(trial.actions), 'goals': len(trial.goals),
         'stable_goals': sum(goal.stable for goal in trial.goals),
+        'averaged_chains': sum(goal.count for goal in trial.goals if goal.count > 1),
         'timed_goals': sum(not goal.stable for goal in trial.goals),
         'duration_s': max(trial.goals[-1].time, *(hand.end for hand in trial.hands)),
         'moving_start': trial.velocity is not None,

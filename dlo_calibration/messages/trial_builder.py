@@ -327,7 +327,8 @@ class TrialBuilder:
             return ()
         return InputError(
             str(left_out[0].message), 'a DLO that had come to rest and moves again', 'an action before that',
-            'the goal chains from then on are left out; if a hand moved the DLO, send the action'),
+            'the goal chains from then on are left out, as they should be if it was laid out for the next '
+            'trial; if a hand moved it in this trial, send that action'),
 
     def _velocity(self) -> Floats | None:
         if len(self.starts) < 2:

@@ -178,10 +178,11 @@ class Chain:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def observed(self) -> Floats:
-        """The points, (n, 3) [m]; NaN where a point was not seen."""
-        return self.points if self.seen.all() else np.where(self.seen[:, None], self.points, np.nan)
+        """The points, (n, 3) [m]; NaN where a point was not seen; read-only."""
+        return self.points if self.seen.all() else frozen_array(
+            np.where(self.seen[:, None], self.points, np.nan))
 
     def put_back(self, places: Floats) -> Chain:
         """Return the chain, its unseen points put back by arc lengths of all points, (n,) in any unit."""

@@ -231,6 +231,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
              f"{number(trial['duration_s'])} s",
              ', '.join(word for word, there in (
+                 (f"mean of {trial['averaged_chains']} chains at rest", trial['averaged_chains']),
                  ('annotated hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
                 (f"{trial['unseen_points']} points not seen", trial['unseen_points'])) if there) or '-')

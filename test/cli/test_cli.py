@@ -3,6 +3,7 @@
 
 """The command line: what it prints, where, and how it ends."""
 
+import copy
 import csv
 import errno
 import hashlib
@@ -32,7 +33,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
 from dlo_calibration.inference.slices import simulate_slices
-from dlo_calibration.messages.codec import bag_types, INITIAL
+from dlo_calibration.messages.codec import bag_types, GOAL, INITIAL
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
@@ -233,6 +234,21 @@ def test_info_tells_what_is_in_a_session(run, session):
     for_people = run('info', session)[1]
     assert 'left_hand' in for_people
     assert 'Calibrated: flexibility' in for_people
+
+
+def test_info_tells_of_how_many_chains_a_goal_is_the_mean(run, tmp_path):
+    messages = session_messages(TYPES, 1)
+    (_, goal), = (pair for pair in messages if pair[0] == GOAL)
+    later = []
+    for k in range(1, 40):
+        one = copy.deepcopy(goal)
+        one.header.stamp.sec += k
+        later.append((GOAL, one))
+    code, output, _ = run('info', write_session(tmp_path / 'stream.mcap', [*messages, *later]), '--json')
+    trial, = only_json(output)['trials']
+    assert (code, trial['stable_goals'], trial['timed_goals']) == (0, 1, 0)
+    assert trial['averaged_chains'] > 5
+    assert f"mean of {trial['averaged_chains']}" in run('info', tmp_path / 'stream.mcap')[1]
 
 
 def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
