@@ -118,6 +118,17 @@ def test_trial_that_only_has_the_name_of_one_of_the_result_is_shown_as_measured(
     assert 'trial_1/simulated' not in shown(types, [other], result)
 
 
+def test_a_tracker_that_goes_on_after_the_result_does_not_hide_what_was_simulated(types, result):
+    def streamed(trial, count):
+        goals = [replace(goal, chain=Chain(goal.chain.points + 1e-5 * count), count=count)
+                 for goal in trial.goals]
+        return replace(trial, goals=tuple(goals))
+
+    calibrated = replace(result, trials=tuple(streamed(trial, 40) for trial in result.trials))
+    found = shown(types, [streamed(trial, 50) for trial in toy_trials(2)], calibrated)
+    assert 'trial_2/simulated' in found
+
+
 def test_same_thing_has_the_same_id_in_every_message_and_no_two_share_one(types, result):
     before = {(m.ns, m.id): m.type for ms in shown(types, result.trials).values() for m in ms}
     after = [((m.ns, m.id), m.type) for ms in shown(types, result.trials, result).values() for m in ms]
