@@ -19,9 +19,12 @@ import queue
 import threading
 from typing import Any, Iterator, Sequence, Union
 
+import numpy as np
+
 from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.prior import prior
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluator import mean_length
@@ -132,7 +135,8 @@ class LiveInformation:
         new = [(trial, tuple(keys[:k + 1])) for k, trial in enumerate(trials) if keys[k] not in done]
         if all(key in informations for _, key in new):
             return
-        known, kept = Knowledge.before(trials, space, height), []
+        start, default = prior(trials, options).hints.start, space.default_point()
+        known, kept = Knowledge.before(space.free, np.where(np.isnan(start), default, start)), []
         if result is not None and done and examination is not None:
             known = Knowledge(known.names, result.best.point, examination.uncertainty)
             kept = list(result.trials)

@@ -35,7 +35,6 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace, REST_SHAPE
 from dlo_calibration.model.score import residuals, seen_points
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
-from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, smooth
 from dlo_calibration.simulation.protocol import Simulator
@@ -84,14 +83,12 @@ class Knowledge:
     models: tuple[TrialModel, ...] = ()
 
     @classmethod
-    def before(cls, trials: Sequence[Trial], space: ParameterSpace, table_height: float | None) -> Knowledge:
-        """Return what is known before any simulation: estimates from the chains alone, or the defaults."""
-        start = start_point(trials, space, table_height)
-        point = np.where(np.isnan(start), space.default_point(), start)
-        known = np.ones(space.dimension)
-        return cls(space.free, point, Uncertainty(
+    def before(cls, names: tuple[str, ...], point: Floats) -> Knowledge:
+        """Return what is known before any simulation, with a (d,) point to begin at."""
+        known = np.ones(len(names))
+        return cls(names, point, Uncertainty(
             UNKNOWN_STD * known, 0 * known, known, known == 0, known == 0,
-            UNKNOWN_STD**2 * np.eye(space.dimension)))
+            UNKNOWN_STD**2 * np.eye(len(names))))
 
 
 
