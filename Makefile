@@ -57,6 +57,7 @@ test: export OPENBLAS_NUM_THREADS := 1
 test: export OPENCV_FOR_THREADS_NUM := 1
 test: $(STAMP)
 	@cores=$$(nproc)
+	$(PYTHON) -m dlo_calibration warm-up  # once for all processes of the tests
 	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10
 
 lint: $(STAMP)
@@ -109,5 +110,5 @@ $(STAMP): setup.py
 	  echo 'PyBullet has no binary for this Python: it is compiled now, which takes about four minutes more.'
 	fi
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable $(REQUIREMENTS)
-	$(PYTHON) -c 'import dlo_calibration.capture.path, dlo_calibration.simulation.kernels'  # compiles them, once for all processes of a test
+	$(PYTHON) -m dlo_calibration warm-up
 	touch $@

@@ -43,7 +43,8 @@ from bisect import bisect_right, insort
 from itertools import pairwise
 from typing import Iterable
 
-from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.declaration import OBSERVATION
+from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, NANOSECONDS
 from dlo_calibration.messages.doubts import doubts
@@ -52,6 +53,7 @@ from dlo_calibration.messages.trial_builder import Key, Message, moved, order, T
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
+USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB
@@ -87,7 +89,9 @@ class TrialCollector:
         self._early: list[InputError] = []
 
     def with_options(self, options: Options) -> TrialCollector:
-        """Return a collector with the same messages, including refused ones, and other options."""
+        """Return one with the same messages, refused ones too, and other options; this one if it would do."""
+        if all(getattr(options, name) == getattr(self._options, name) for name in USED):
+            return self
         other = TrialCollector(options)
         gone = [builder for builder in self._builders if builder.until is not None]
         for key in sorted(self._known):
