@@ -134,6 +134,9 @@ class CalibratorNode(GraphNode[Options]):
 
     def _work(self, seconds: float = SLICE) -> None:
         """Collect waiting messages for some time, and see to it that the others are collected soon."""
+        if self._changed:  # what comes next is judged with the new values
+            self._changed = False
+            self.session.take_options()
         if not self._in_frame():
             return
         self._working = True
@@ -205,9 +208,6 @@ class CalibratorNode(GraphNode[Options]):
         self._after_jump()
         if self._frame.missing and len(self._inbox):
             self._work()
-        if self._changed:  # what comes next is judged with the new values
-            self._changed = False
-            self.session.take_options()
         self.session.drop(self._inbox.take_dropped())
         self.session.tick()
 
