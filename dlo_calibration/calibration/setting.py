@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Callable
 
 from dlo_calibration.calibration.automatic import choose, chooses_parts
@@ -66,9 +67,16 @@ class Setting:
 
         Its residuals are those of the compared goals.
         """
+        if trials is None and finer is None:
+            return self._usual.of(space, self.memory)
         evaluator = Evaluator(trials or self.trials, space, finer or self.simulator, every_goal=False)
         return BatchEvaluator(evaluator, self.should_stop, self.executor,
                               self.memory.of(evaluator, finer is not None))
+
+    @cached_property
+    def _usual(self) -> BatchEvaluator:
+        return BatchEvaluator(Evaluator(self.trials, self.options.space, self.simulator, every_goal=False),
+                              self.should_stop, self.executor)
 
     def judged(self, space: ParameterSpace, one: Evaluation) -> Evaluation:
         """

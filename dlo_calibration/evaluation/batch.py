@@ -22,6 +22,7 @@ from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.memory import EvaluatorMemory, Memory
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import ParameterSpace
 
 
 class BatchEvaluator:
@@ -43,7 +44,14 @@ class BatchEvaluator:
         self._should_stop = should_stop
         self._executor = executor
         self._parcel = _Parcel(evaluator)
-        self._key = uuid.uuid4().hex  # identifies this calibration on all machines
+        self._key = uuid.uuid4().hex  # identifies these trials on all machines
+
+    def of(self, space: ParameterSpace, memory: Memory) -> BatchEvaluator:
+        """Return one of the same trials with other parameters: workers keep what belongs to the trials."""
+        other = copy.copy(self)
+        other.evaluator = self.evaluator.of(space)
+        other._memory = memory.of(other.evaluator)
+        return other
 
     def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
         """Yield the evaluations of (k, d) points; the first one has the index `first`."""
@@ -65,7 +73,8 @@ class BatchEvaluator:
     def _in_parallel(self, points: Floats, first: int, executor: Executor) -> Iterator[Evaluation]:
         known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
         futures: dict[int, Future[Evaluation]] = {
-            k: executor.submit(_evaluate_in_worker, self._key, self._parcel, first + k, points[k])
+            k: executor.submit(_evaluate_in_worker, self._key, self._parcel, self.evaluator.space, first + k,
+                               points[k])
             for k, one in enumerate(known) if one is None}
         finished: queue.SimpleQueue[Future[Evaluation]] = queue.SimpleQueue()
         for future in futures.values():
@@ -152,6 +161,7 @@ class _WorkerThread(threading.local):
 _worker_thread = _WorkerThread()
 
 
-def _evaluate_in_worker(key: str, parcel: _Parcel, index: int, point: Floats) -> Evaluation:
-    """Evaluate a point in a worker, which keeps the evaluator of a calibration."""
-    return _worker_thread.of(key, parcel).evaluate(index, point)
+def _evaluate_in_worker(key: str, parcel: _Parcel, space: ParameterSpace, index: int, point: Floats
+                        ) -> Evaluation:
+    """Evaluate a point of a space in a worker, which keeps the evaluator of the trials."""
+    return _worker_thread.of(key, parcel).of(space).evaluate(index, point)
