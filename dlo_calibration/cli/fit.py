@@ -109,9 +109,9 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
                 raise KeyboardInterrupt(stop.exit_code) from None
         stopped = stop()
         try:
+            print_result(result, chosen.json, told)  # first, as the page takes seconds
+        finally:  # whatever becomes of the output
             attempts = None if folder is None else write_files(folder, source, result, make_simulator, stop)
-        finally:  # whatever the disk does
-            print_result(result, chosen.json, told)
         if attempts is not None:
             attempts.require()
             tell(f'{", ".join(file_names(source))} are in {folder}')
