@@ -197,7 +197,7 @@ def test_advised_actions_can_be_done_with_a_chain_of_any_shape(name):
         assert one.trial.initial is chain
         for hand in one.trial.hands:
             assert np.isfinite(hand.positions).all()
-            assert hand.positions[0] == pytest.approx(chain.points[hand.grips[0]])
+            assert hand.positions[0] == pytest.approx(chain.gripped(hand.grips, hand.offset)[0])
         for goal in one.trial.goals:
             assert goal.stable is ('while it moves' not in one.words)
             assert bool(one.trial.holding(goal)) is (one.action in ('lift_and_hold', 'two_hands') or

@@ -120,7 +120,7 @@ def test_the_refused_goals_are_taken_where_the_options_allow_them():
 
 
 @pytest.mark.parametrize('text, problem', [
-    ('0,0,0\n1,0,0\n', '2 point(s)'), ('0,0,0\n0.1,nan,0\n0.2,0,0\n', 'NaN or infinity in point(s) 1'),
+    ('0,0,0\n1,0,0\n', '2 point(s)'), ('0,0,0\n0.1,nan,0\n0.2,0,0\n', 'NaN in point(s) 1'),
     ('', '0 point(s)'), ('0,0\n', "'0,0'"), ('0,0,0\n0,0,0\n1,0,0\n', 'coincident neighbours'),
     ('x,y,z\n', "'x,y,z'")])
 def test_a_file_that_is_no_chain_is_refused_in_one_sentence(text, problem, tmp_path):
