@@ -135,9 +135,9 @@ class Day:
         self.get = self.node.create_client(GetParameters, f'{NODE}/get_parameters')
         self.set = self.node.create_client(SetParameters, f'{NODE}/set_parameters')
         self.node.create_timer(1 / RATE, self.track)
-        executor = MultiThreadedExecutor(2)
-        executor.add_node(self.node)
-        threading.Thread(target=executor.spin, daemon=True).start()
+        self.executor = MultiThreadedExecutor(2)
+        self.executor.add_node(self.node)
+        threading.Thread(target=self.executor.spin, daemon=True).start()
         threading.Thread(target=self.probe, daemon=True).start()
 
     @property
@@ -277,8 +277,9 @@ def main() -> None:
     finally:
         child.kill()
         child.wait()
-    print_day(day, figures, folder)
+    day.executor.shutdown()
     rclpy.try_shutdown()
+    print_day(day, figures, folder)
 
 
 def print_day(day: Day, figures: dict[str, float], folder: Path) -> None:
