@@ -23,7 +23,7 @@ def plain(result: CalibrationResult) -> dict[str, Any]:
     """
     found, other, advice = result.examination, result.confirmation, result.advice
     values: dict[str, Any] = known({
-        'usable': result.usable,
+        'unusable': result.unusable,
         'parameters': {name: _without_name(one) for name, one in result.parameters.items()},
         **_fit(result.best.score, result.best.scores, result.errors),
         'error_percent_of_length': 100 * result.errors.mean / result.length,

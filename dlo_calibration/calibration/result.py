@@ -113,7 +113,7 @@ class CalibrationResult:
             seed=setting.options.seed, warnings=_warnings(best, found.evaluations), examination=examination)
 
     @property
-    def usable(self) -> str:
+    def unusable(self) -> str:
         """
         Why the parameters should not be used, in one sentence; '' if they can be.
 

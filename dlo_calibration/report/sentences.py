@@ -22,7 +22,7 @@ MOST_COMBINATIONS = 3  # of parameters that the trials do not determine are told
 
 def verdict(result: CalibrationResult) -> str:
     """Return the first sentence that a user should read: whether the parameters can be used, or why not."""
-    return f'Do not use this result: {result.usable}.' if result.usable else 'This result is usable.'
+    return f'Do not use this result: {result.unusable}.' if result.unusable else 'This result is usable.'
 
 
 def sentences(result: CalibrationResult) -> list[str]:

@@ -61,7 +61,7 @@ def result(types: MessageTypes, found: CalibrationResult, stamp: int) -> Any:
     # These have a status or keys of their own, or are too long for a message.
     left_out = ('parameters', 'correlations', 'advice', 'explanations', 'confirmation')
     statuses.append(diagnostic_status(
-        types, WARN if found.warnings or found.usable else OK, WHOLE,
+        types, WARN if found.warnings or found.unusable else OK, WHOLE,
         f'{sentences.verdict(found)} Score {number(found.best.score)}, '
         f'mean error {measured(found.errors.mean, "m")}; '
         f'{found.stop_reason}',

@@ -333,7 +333,7 @@ class CalibrationSession:
         calibration.situation.result = event
         if situation is not calibration.situation:
             situation.detail += '; this is the result of the session before the clock went back'
-        (self._graph.warn if event.usable else self._graph.info)(sentences.verdict(event))
+        (self._graph.warn if event.unusable else self._graph.info)(sentences.verdict(event))
         self._graph.info(diagnostics.in_one_line(event))
         for warning in event.warnings:
             self._graph.warn(warning)

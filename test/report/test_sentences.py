@@ -51,32 +51,33 @@ def with_error(found, metres):
 
 
 def test_good_result_is_usable(result):
-    assert result.usable == ''
+    assert result.unusable == ''
     assert verdict(result) == 'This result is usable.'
     stopped = 'budget of 20 evaluations spent'
-    assert replace(result, stop_reason=stopped).usable == ''
+    assert replace(result, stop_reason=stopped).unusable == ''
 
 
 def test_result_that_should_not_be_used_says_why(result):
     found = result.examination
     implausible = replace(result, doubts=('trial 1: got a DLO in the air',))
     assert verdict(implausible) == 'Do not use this result: trial 1: got a DLO in the air.'
-    assert '51.7 % of the length: check frames' in with_error(result, 0.517 * result.length).usable
+    assert '51.7 % of the length: check frames' in with_error(result, 0.517 * result.length).unusable
     apart = Confirmation('bullet', 1.0, (1.0, 1.0), result.errors, 0.02, 0.1)
-    assert 'engine bullet differs from toy by 20 mm' in replace(result, confirmation=apart).usable
+    assert 'engine bullet differs from toy by 20 mm' in replace(result, confirmation=apart).unusable
     near = replace(apart, mean_distance=0.0003)
-    assert replace(result, confirmation=near).usable == ''
+    assert replace(result, confirmation=near).unusable == ''
     early = replace(result, examination=None, stop_reason='stopped on request')
-    assert 'not reached a minimum (stopped on request)' in early.usable
-    assert 'not reached a minimum' in replace(result, examination=replace(found, regular=False)).usable
+    assert 'not reached a minimum (stopped on request)' in early.unusable
+    assert 'not reached a minimum' in replace(result, examination=replace(found, regular=False)).unusable
     spread = replace(found.uncertainty, residual=0.01)
     poor = replace(found, default_error=0.01, uncertainty=spread, noise=1e-4)
-    assert 'the default parameters fit as well' in with_error(replace(result, examination=poor), 0.02).usable
-    assert with_error(replace(result, examination=replace(poor, noise=0.01)), 0.02).usable == ''
+    no_better = with_error(replace(result, examination=poor), 0.02)
+    assert 'the default parameters fit as well' in no_better.unusable
+    assert with_error(replace(result, examination=replace(poor, noise=0.01)), 0.02).unusable == ''
     blind = {name: replace(one, verdict=NOT_IDENTIFIABLE) for name, one in result.parameters.items()}
-    assert 'determine none of the parameters' in replace(result, parameters=blind).usable
+    assert 'determine none of the parameters' in replace(result, parameters=blind).unusable
     one = {**blind, 'friction': result.parameters['friction']}
-    assert replace(result, parameters=one).usable == ''
+    assert replace(result, parameters=one).unusable == ''
 
 
 def test_stiffness_per_weight_is_explained():

@@ -70,7 +70,7 @@ def test_result_tells_the_whole(types):
     assert values == {
         'score': '30.375', 'trials': '2', 'evaluations': '3', 'simulations': '6', 'engine': 'bullet',
         'search': 'random', 'seed': '7', 'stop_reason': 'budget of 3 evaluations spent', 'choice': '',
-        'usable': '', 'warnings': 'one; two', 'undetermined': '',
+        'unusable': '', 'warnings': 'one; two', 'undetermined': '',
         'cross_validated_error_mm': '', 'default_error_mm': '',
         'noise_mm': '', 'residual_std_mm': ''}
     assert one.level == types.level(1)
@@ -83,7 +83,7 @@ def test_result_tells_the_whole(types):
     one, values = by_name(diagnostics.result(types, poor, STAMP))['calibration']
     assert one.level == types.level(1)
     assert one.message.startswith('Do not use this result: trial 1: got a DLO in the air. Score')
-    assert values['usable'] == 'trial 1: got a DLO in the air'
+    assert values['unusable'] == 'trial 1: got a DLO in the air'
 
 
 def test_progress_tells_the_best_so_far_and_what_is_left(types):

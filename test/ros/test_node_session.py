@@ -122,8 +122,8 @@ def test_requests_that_do_not_fit_are_refused_and_stop_gives_the_best_so_far(sta
     graph.until(lambda: graph.status['state'] == 'done')
     found = whole(graph.heard['result'][0])
     assert found['stop_reason'] == 'stopped on request'
-    assert graph.status['detail'] == f"Do not use this result: {found['usable']}. stopped on request"
-    assert 'the search has not reached a minimum (stopped on request)' in found['usable']
+    assert graph.status['detail'] == f"Do not use this result: {found['unusable']}. stopped on request"
+    assert 'the search has not reached a minimum (stopped on request)' in found['unusable']
 
 
 def test_reset_forgets_the_trials_and_begins_another_session(start, tmp_path, command):
