@@ -1,15 +1,69 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Launching: what both launch files check before they start anything; it imports neither ROS nor launch."""
+"""Launching: what the launch files describe, and what they check before they start anything."""
 
 from __future__ import annotations
 
 from pathlib import Path
 import sys
-from typing import Iterable, Mapping, Sequence
+from typing import Any, Iterable, Mapping, Sequence
 
 from dlo_calibration.errors import InputError, meant
+
+
+def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics: Mapping[str, str],
+                  shown: Sequence[str]) -> Any:
+    """
+    Return a LaunchDescription of a node with its parameter file, and of RViz if wanted.
+
+    :param file: the launch file.
+    :param parameters: those that are launch arguments, with their descriptions; empty: as the file says.
+    :param topics: input topics that are launch arguments, likewise; empty: the node's own.
+    :param shown: topics that RViz shows.
+    :raises InputError: for an unknown argument, or where RViz is wanted and not installed.
+    """
+    from ament_index_python.packages import get_package_share_directory
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    from launch.conditions import IfCondition
+    from launch.substitutions import LaunchConfiguration
+    from launch_ros.actions import Node
+
+    config = Path(get_package_share_directory('dlo_calibration')) / 'config'
+    arguments = {
+        'params_file': (str(config / f'{node}.yaml'),
+                        'parameters of the node; copy the default and change the copy'),
+        'namespace': ('', 'namespace of the node'),
+        **{name: ('', f'{words}; empty: as the parameter file says') for name, words in parameters.items()},
+        **{name: ('', f"{words}; empty: the node's own") for name, words in topics.items()},
+        'frame': ('world', 'frame_id of the chains, which RViz shows'),
+    }
+    check_arguments(file, (*arguments, 'rviz'))
+
+    def start(context: Any) -> list[Any]:
+        value = {name: LaunchConfiguration(name).perform(context) for name in (*arguments, 'rviz')}
+        check_rviz(value['rviz'])
+        given = {name: value[name] for name in topics}
+        return [
+            Node(package='dlo_calibration', executable=node, name=node, output='screen',
+                 namespace=value['namespace'],
+                 # `parameters` would only warn if the file is missing; this ends the node with an error
+                 ros_arguments=['--params-file', LaunchConfiguration('params_file'),
+                                *flags({name: value[name] for name in parameters}, given)]),
+            Node(package='rviz2', executable='rviz2', name='rviz2',
+                 arguments=['-d', str(config / f'{node}.rviz'), '-f', LaunchConfiguration('frame')],
+                 remappings=remapped(node, value['namespace'], shown, given),
+                 condition=IfCondition(LaunchConfiguration('rviz'))),
+        ]
+
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=description)
+          for name, (default, description) in arguments.items()),
+        DeclareLaunchArgument('rviz', default_value='false', choices=['true', 'false'],
+                              description='start RViz too (the package rviz2)'),
+        OpaqueFunction(function=start),  # an argument that is empty is left out, which needs its value
+    ])
 
 
 def check_arguments(file: str, known: Sequence[str], words: Sequence[str] | None = None) -> None:
@@ -54,8 +108,8 @@ def flags(parameters: Mapping[str, str], topics: Mapping[str, str]) -> list[str]
             *(word for name, value in topics.items() if value for word in ('-r', f'~/{name}:={value}'))]
 
 
-def shown(node: str, namespace: str, names: Iterable[str],
-          topics: Mapping[str, str]) -> list[tuple[str, str]]:
+def remapped(node: str, namespace: str, names: Iterable[str],
+             topics: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return the remappings with which RViz shows what a node in a namespace sends and hears."""
     place = f'/{namespace.strip("/")}/{node}' if namespace.strip('/') else f'/{node}'
     pairs = [(f'/{node}/{name}', topics.get(name) or f'{place}/{name}') for name in names]
