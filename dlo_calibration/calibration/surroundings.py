@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from concurrent.futures import CancelledError
 from dataclasses import replace
-from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,11 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
-from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import REST_SHAPE
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
+from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
+
+CHAINS = 16  # initial chains with other noise, over all trials
 
 
 def examined(setting: Setting, fit: Fit) -> Fit:
@@ -61,8 +61,8 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
             default=default, noise=sigma,
             finer=None if finer is None else setting.evaluate(space, finer=finer).residuals,
-            starts=[setting.evaluate(space, others).residuals
-                    for others in _other_starts(trials, sigma)] if noisy else [],
+            starts=[setting.evaluate(space, others).residuals for others in with_other_noise(
+                trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0))] if noisy else [],
             fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:
@@ -96,26 +96,3 @@ def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDA
     moved = np.array(point)
     moved[excited] = np.clip(point[excited] + np.clip(step, -0.1, 0.1), 0.0, 1.0)
     return moved
-
-
-def _other_starts(trials: Sequence[Trial], sigma: float) -> list[tuple[Trial, ...]]:
-    """
-    Return copies of all trials, whose initial chains have other noise; 16 chains over all trials are enough.
-
-    New noise is added to the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
-    Introduction to the Bootstrap, 1993, 6.5), the same to chains that are equal to the digit; every call
-    makes the same draws.
-
-    :param sigma: noise level: standard deviation of one coordinate [m].
-    """
-    generator = np.random.default_rng(0)
-
-    def drawn() -> tuple[Trial, ...]:
-        found: dict[bytes, Chain] = {}
-        for trial in trials:
-            points = smooth(trial.initial.points, sigma)
-            found.setdefault(trial.initial.points.tobytes(), replace(
-                trial.initial, points=points + generator.normal(0, sigma, points.shape)))
-        return tuple(replace(trial, initial=found[trial.initial.points.tobytes()]) for trial in trials)
-
-    return [drawn() for _ in range(-(-16 // len(trials)))]

@@ -13,7 +13,7 @@ search for the best values is shorter, and of a stream, fewer goals are compared
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Iterator, Sequence
+from typing import Sequence
 import zlib
 
 import numpy as np
@@ -36,7 +36,7 @@ from dlo_calibration.model.parameters import ParameterSpace, REST_SHAPE
 from dlo_calibration.model.score import residuals, seen_points
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
-from dlo_calibration.observation.noise import NO_NOISE, smooth
+from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
 from dlo_calibration.simulation.protocol import Simulator
 
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
@@ -89,7 +89,6 @@ class Knowledge:
         return cls(names, point, Uncertainty(
             UNKNOWN_STD * known, 0 * known, known, known == 0, known == 0,
             UNKNOWN_STD**2 * np.eye(len(names))))
-
 
 
 def without_repeated_goals(trial: Trial) -> Trial:
@@ -207,10 +206,11 @@ class Appraiser:
     def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:
         """Simulate other noise of the initial chain, and finer."""
         point, moved, finer, fine = model.fit.point, model.moved, None, self.simulator.refined()
+        generator = np.random.default_rng(zlib.crc32(trial.initial.points.tobytes()))  # the same each time
         try:
             if self.noise > NO_NOISE and 'length_scale' not in self.space.free:
                 moved = np.array([self._simulated(one, point) - model.fit.residuals
-                                  for one in _other_starts(trial, self.noise)])
+                                  for one, in with_other_noise([trial], self.noise, STARTS, generator)])
             if fine is not None:
                 finer = self._simulated(trial, point, fine) - model.fit.residuals
         except SimulationError:
@@ -227,13 +227,3 @@ def _whole(models: Sequence[TrialModel], trials: Sequence[Trial], point: Floats
     fits = [one.fit for one in models]
     return Linearisation(point, np.concatenate([one.predicted(point - one.point) for one in fits]),
                          np.concatenate([one.jacobian for one in fits])), ResidualLayout.of(trials)
-
-
-def _other_starts(trial: Trial, noise: float) -> Iterator[Trial]:
-    """Yield copies of a trial whose initial chain has other noise; every call makes the same draws."""
-    points = trial.initial.points
-    generator = np.random.default_rng(zlib.crc32(points.tobytes()))
-    smoothed = smooth(points, noise)
-    for _ in range(STARTS):
-        yield replace(trial, initial=replace(
-            trial.initial, points=smoothed + generator.normal(0, noise, points.shape)))

@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise: the noise level of observed points, from roughness along chains and over time, and its removal."""
+"""Noise: the level of noise of observed points, from roughness along chains and over time; its removal."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Sequence
 
 import numpy as np
 
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
 
 ORDERS = range(2, 9)  # of the differences; higher orders do not separate curve and noise any better
@@ -171,6 +172,28 @@ def smooth(points: Floats, noise: float) -> Floats:
     kept = 1 / (1 + SMOOTHING[:, None] * np.maximum(stiffness, 0))
     risk = (1 - kept)**2 @ np.sum(parts**2, axis=1) + 2 * 3 * noise**2 * kept.sum(axis=1)
     return np.asarray(modes @ (kept[np.argmin(risk)][:, None] * parts))
+
+
+def with_other_noise(trials: Sequence[Trial], noise: float, count: int,
+                     generator: np.random.Generator) -> list[tuple[Trial, ...]]:
+    """
+    Return `count` copies of all trials, whose initial chains have other noise.
+
+    New noise is added to the smoothed chains (a parametric bootstrap: Efron and Tibshirani, An
+    Introduction to the Bootstrap, 1993, 6.5), the same to chains that are equal to the digit.
+
+    :param noise: standard deviation of one coordinate [m].
+    """
+    smoothed = [smooth(trial.initial.points, noise) for trial in trials]
+
+    def drawn() -> tuple[Trial, ...]:
+        found: dict[bytes, Chain] = {}
+        for trial, points in zip(trials, smoothed, strict=True):
+            points = points + generator.normal(0, noise, points.shape)
+            found.setdefault(trial.initial.points.tobytes(), replace(trial.initial, points=points))
+        return tuple(replace(trial, initial=found[trial.initial.points.tobytes()]) for trial in trials)
+
+    return [drawn() for _ in range(count)]
 
 
 def places_along(points: Floats, noise: float) -> Floats:
