@@ -128,13 +128,13 @@ class LiveInformation:
     def _appraise(self, job: _Job, trials: Sequence[Trial], options: Options,
                   result: CalibrationResult | None, informations: _Known) -> None:
         space, height = options.space, options.table_height if options.table else None
-        trials = with_shared_places(trials)
         examination = None if result is None else result.examination
         done = fingerprints(result.trials) if result and examination and examination.regular else []
         keys = fingerprints(trials)
-        new = [(trial, tuple(keys[:k + 1])) for k, trial in enumerate(trials) if keys[k] not in done]
+        new = [(k, tuple(keys[:k + 1])) for k, key in enumerate(keys) if key not in done]
         if all(key in informations for _, key in new):
             return
+        trials = with_shared_places(trials)
         start, default = prior(trials, options).hints.start, space.default_point()
         known, kept = Knowledge.before(space.free, np.where(np.isnan(start), default, start)), []
         if result is not None and done and examination is not None:
@@ -142,8 +142,8 @@ class LiveInformation:
             kept = list(result.trials)
         with (closing(self._make_simulator(options)) as simulator,
               closing(ProcessExecutor(1, answer_limit=options.answer_limit)) as process):
-            for trial, key in new:
-                fresh = key not in informations
+            for k, key in new:
+                trial, fresh = trials[k], key not in informations
                 doubts = implausible(trial, height, bool(options.scene)) if fresh else ()
                 if doubts:  # its information would be about another world
                     informations[key] = doubts[0]

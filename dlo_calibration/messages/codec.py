@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 import importlib
 from typing import Any, Callable, Mapping
 
@@ -298,6 +298,7 @@ def rclpy_types() -> MessageTypes:
     """Return the message classes of the ROS 2 installation."""
     from array import array
 
+    @cache  # markers have thousands of points, and the search for their class takes as long as they do
     def find(type_name: str) -> Any:
         package, _, name = type_name.split('/')
         return getattr(importlib.import_module(f'{package}.msg'), name)

@@ -41,7 +41,7 @@ from __future__ import annotations
 
 from bisect import bisect_right, insort
 from itertools import pairwise
-from typing import Iterable
+from typing import Iterable, Iterator
 
 from dlo_calibration.calibration.declaration import OBSERVATION
 from dlo_calibration.calibration.options import names_of, Options
@@ -73,10 +73,6 @@ class TrialCollector:
 
     def __init__(self, options: Options) -> None:
         self._options, self.pose = options, options.pose
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all messages and their frame_id."""
         self._frame: str | None = None
         self._builders = [TrialBuilder((0, 0, ()))]
         self._known: dict[Key, Message] = {}
@@ -88,25 +84,33 @@ class TrialCollector:
         self._doubts: list[str] = []
         self._early: list[InputError] = []
 
-    def with_options(self, options: Options) -> TrialCollector:
-        """Return one with the same messages, refused ones too, and other options; this one if it would do."""
+    def with_options(self, options: Options) -> tuple[TrialCollector, Iterator[int]]:
+        """
+        Return a collector with other options, and steps that fill it with the same messages.
+
+        Each step collects one message, refused ones too, and gives how many are left. Where the options of
+        the observation are the same, the collector is this one, and there is no step.
+        """
         if all(getattr(options, name) == getattr(self._options, name) for name in USED):
-            return self
+            return self, iter(())
         other = TrialCollector(options)
+        return other, self._filling(other)
+
+    def _filling(self, other: TrialCollector) -> Iterator[int]:
         gone = [builder for builder in self._builders if builder.until is not None]
-        for key in sorted(self._known):
+        for left, key in zip(range(len(self._known), 0, -1), sorted(self._known), strict=True):
             while gone and gone[0].first < key:
                 other._leave_out(gone.pop(0))
             try:
                 other.add(self._known[key])
             except InputError:
                 pass  # it is among `other.problems`
+            yield left
         for one in gone:
             other._leave_out(one)
         other._early = []  # they were told
         for begin, end in self._forgotten:
             other._close(begin, end)
-        return other
 
     def add(self, message: Message) -> None:
         """

@@ -136,13 +136,16 @@ class CalibratorNode(GraphNode[Options]):
         """Collect waiting messages for some time, and see to it that the others are collected soon."""
         if self._changed:  # what comes next is judged with the new values
             self._changed = False
-            self.session.take_options()
+            self.session.change_options()
         if not self._in_frame():
             return
         self._working = True
         until = time.monotonic() + seconds
         try:
-            while len(self._inbox) and time.monotonic() < until:
+            while self._waiting and time.monotonic() < until:
+                if self.session.collecting.left:
+                    self.session.collect_anew()
+                    continue
                 kind, octets = self._inbox.take()
                 if octets is None:
                     done, answer = self.session.request(kind)
@@ -153,9 +156,14 @@ class CalibratorNode(GraphNode[Options]):
         finally:
             self._working = False
             self.session.flush()
-        self.session.behind = len(self._inbox) > 0
+        self.session.behind = self._waiting > 0
         if self.session.behind:
             self._more.trigger()
+
+    @property
+    def _waiting(self) -> int:
+        """How many messages wait to be collected, for the first time or anew."""
+        return len(self._inbox) + self.session.collecting.left
 
     def _in_frame(self) -> bool:
         """Tell whether messages can be read: they wait while the pose of their frame is missing."""
@@ -173,7 +181,7 @@ class CalibratorNode(GraphNode[Options]):
             self._waited = words
             return False
         self.info(words)
-        self.session.take_options()
+        self.session.change_options()
         return True
 
     def _on_message_lost(self, kind: str, event: Any) -> None:
@@ -195,11 +203,11 @@ class CalibratorNode(GraphNode[Options]):
 
     def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.hear_waiting()
-        if name == 'stop' or not len(self._inbox):
+        if name == 'stop' or not self._waiting:
             response.success, response.message = self.session.request(name)
         else:
             response.success, response.message = True, \
-                f'{len(self._inbox)} messages came before; {name} follows when they are read'
+                f'{self._waiting} messages came before; {name} follows when they are read'
             self._inbox.put_request(name)
         return response
 

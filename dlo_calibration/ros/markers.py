@@ -72,10 +72,17 @@ def error_colour(share: float) -> Colour:
     return min(2 * red, 1.0), min(2 - 2 * red, 1.0), 0.1
 
 
+def alike(trials: Sequence[Trial], others: Sequence[Trial]) -> bool:
+    """Tell whether trials look the same: only the mean of a stream that goes on may differ."""
+    return len(trials) == len(others) and all(
+        len(one.actions) == len(two.actions) and np.array_equal(one.initial.points, two.initial.points)
+        and _same(one, two) for one, two in zip(trials, others, strict=True))
+
+
 def _same(trial: Trial, other: Trial) -> bool:
     """Tell whether two trials have the same goals; a tracker that goes on changes the mean of a stream."""
     return trial is other or len(trial.goals) == len(other.goals) and all(
-        min(one.count, two.count) > 1 and one.time == two.time
+        min(one.count, two.count) > 1 and one.time == two.time or one.chain is two.chain
         or np.array_equal(one.chain.points, two.chain.points)
         for one, two in zip(trial.goals, other.goals, strict=True))
 
@@ -142,6 +149,11 @@ class Brush:
         self._types = types
         self._header = header
         self._prefix = prefix
+        build = types.build  # these are the same in all markers
+        self._lifetime = build('builtin_interfaces/msg/Duration', sec=0, nanosec=0)
+        self._texture = build('sensor_msgs/msg/CompressedImage', header=header, format='',
+                              data=types.octets(b''))
+        self._mesh = build('visualization_msgs/msg/MeshFile', filename='', data=types.octets(b''))
 
     def line(self, name: str, number: int, points: Floats, colour: Colour, scale: float = 1.0) -> Any:
         """Draw a line through (n, 3) points [m]."""
@@ -166,7 +178,7 @@ class Brush:
         :param at: (3,) [m] position; None: the origin.
         :param colours: one for the whole marker, or one per point.
         """
-        build = self._types.build
+        build, point = self._types.build, self._types.find('geometry_msgs/msg/Point')
         points = np.zeros((0, 3)) if points is None else points
         kept = _kept(len(points), group)
         x, y, z = self._pose.points(np.zeros(3) if at is None else at).tolist()
@@ -180,15 +192,11 @@ class Brush:
                        orientation=build('geometry_msgs/msg/Quaternion', **turn)),
             scale=build('geometry_msgs/msg/Vector3', x=size, y=size, z=size),
             color=self._colour(colours[0]),
-            lifetime=build('builtin_interfaces/msg/Duration', sec=0, nanosec=0), frame_locked=False,
-            points=[build('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in points[kept].tolist()],
+            lifetime=self._lifetime, frame_locked=False,
+            points=[point(x=x, y=y, z=z) for x, y, z in points[kept].tolist()],
             colors=[self._colour(colours[k]) for k in kept] if len(colours) > 1 else [],
-            texture_resource='', texture=build(
-                'sensor_msgs/msg/CompressedImage', header=self._header, format='',
-                data=self._types.octets(b'')),
-            uv_coordinates=[], text=text, mesh_resource='', mesh_file=build(
-                'visualization_msgs/msg/MeshFile', filename='', data=self._types.octets(b'')),
-            mesh_use_embedded_materials=False)
+            texture_resource='', texture=self._texture, uv_coordinates=[], text=text, mesh_resource='',
+            mesh_file=self._mesh, mesh_use_embedded_materials=False)
 
     def _colour(self, colour: Colour) -> Any:
         red, green, blue = colour
@@ -198,5 +206,7 @@ class Brush:
 def _kept(count: int, group: int) -> list[int]:
     """Return the indices of at most MOST_POINTS groups, evenly spread over `count` points."""
     groups = count // group
-    chosen = np.unique(np.linspace(0, groups - 1, min(groups, MOST_POINTS)).round().astype(int))
+    if groups <= MOST_POINTS:
+        return list(range(group * groups))
+    chosen = np.linspace(0, groups - 1, MOST_POINTS).round()
     return [group * int(k) + i for k in chosen for i in range(group)]

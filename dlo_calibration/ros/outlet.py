@@ -8,12 +8,15 @@ from __future__ import annotations
 from typing import Any, Callable
 
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.files.intake import OUTPUT_TYPES
+from dlo_calibration.files.result import description_document
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.ros.graph import Graph
-from dlo_calibration.ros.markers import markers
+from dlo_calibration.ros.markers import alike, markers
 from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.ros.situation import Calibration, Pace, Situation
 
@@ -37,6 +40,7 @@ class Outlet:
         self._status: dict[str, Any] = {}  # content of the last message
         self._of: Situation | None = None  # what it was about
         self._sent = float('-inf')  # when it was sent [s]
+        self._shown: tuple[CalibrationResult | None, tuple[Trial, ...]] = None, ()  # in the last markers
 
     def send(self, name: str, message: Any) -> None:
         """Record a message, then publish it: whatever a subscriber received is on the disk."""
@@ -66,7 +70,7 @@ class Outlet:
         content: dict[str, Any] = {
             'state': situation.state, 'trials': collector.count, 'last_refusal': situation.last_refusal,
             'incomplete': collector.incomplete, 'detail': situation.detail or waits,
-            'information': situation.information, 'dropped': situation.told_dropped.total()}
+            'information': situation.information, 'dropped': situation.dropped.told.total()}
         changed = {name for name, value in content.items() if value != self._status.get(name, content)}
         # What changes with each message of a stream is sent once a second.
         if situation is not self._of or changed and (
@@ -75,9 +79,23 @@ class Outlet:
             self._status, self._of, self._sent = content, situation, self._clock()
             self.send('status', diagnostics.status(self._types, stamp=self._graph.stamp(), **content))
 
-    def markers(self, situation: Situation, collector: TrialCollector) -> None:
-        """Send the markers of all trials."""
-        situation.markers = Pace(last=self._clock())
-        self.send('markers', markers(self._types, collector.trials, stamp=self._graph.stamp(),
-                                     frame_id=collector.frame_id, result=situation.result,
-                                     pose=collector.pose))
+    def result(self, result: CalibrationResult, options: Options) -> None:
+        """Send a result, and the description of the DLO that it gives."""
+        self.send('result', diagnostics.result(self._types, result, self._graph.stamp()))
+        self.send('dlo_description', self._types.build(
+            OUTPUT_TYPES['dlo_description'], data=description_document(result, options.flat()).decode()))
+
+    def markers(self, situation: Situation, collector: TrialCollector, at_once: bool) -> None:
+        """Send the markers of all trials, unless the last ones show the same."""
+        # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
+        now, period = self._clock(), 1.0 + 0.1 * collector.count
+        if not at_once and not (
+                situation.markers.wanted and collector.count and now - situation.markers.last >= period):
+            return
+        situation.markers = Pace(last=now)
+        result, trials = situation.result, collector.trials
+        if trials and result is self._shown[0] and alike(trials, self._shown[1]):
+            return
+        self._shown = result, trials
+        self.send('markers', markers(self._types, trials, stamp=self._graph.stamp(),
+                                     frame_id=collector.frame_id, result=result, pose=collector.pose))

@@ -10,7 +10,7 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
-from collections import Counter
+import gc
 import time
 from typing import Callable, Mapping
 
@@ -24,14 +24,13 @@ from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.compiling import Compiling
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.files.result import description_document
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.stamp_order import StampOrder, went_back
 from dlo_calibration.messages.trial_builder import Message
 from dlo_calibration.report import sentences
 from dlo_calibration.ros import diagnostics
+from dlo_calibration.ros.collecting import Collecting
 from dlo_calibration.ros.graph import decoded, Graph, why
 from dlo_calibration.ros.outlet import Outlet
 from dlo_calibration.ros.recorder import Recorder
@@ -57,14 +56,12 @@ class CalibrationSession:
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
         self._make_simulator = make_simulator
-        self._collected_with = graph.options()
-        self._collector = TrialCollector(self._collected_with)
+        self.collecting = Collecting(graph.options())
         self._worker = Worker(make_simulator)
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._outlet = Outlet(graph, types, self._recorder, clock)
-        # In a thread of this process, loading compiled kernels delays no answer by more than 0.1 s.
-        self._compiling = Compiling(then=lambda: make_simulator(self._collected_with).close())
+        self._compiling = Compiling(then=self._load)
         self._situation = Situation()
         self._calibration: Calibration | None = None
         self._order = StampOrder()
@@ -73,6 +70,14 @@ class CalibrationSession:
         self._begin_recording()
         self._compiling.begin()
         self._report()
+
+    @property
+    def _collector(self) -> TrialCollector:
+        return self.collecting.collector
+
+    def _load(self) -> None:
+        self._make_simulator(self.collecting.options).close()  # in a thread: delays no answer by over 0.1 s
+        gc.freeze()  # what is loaded stays for ever; each search for garbage in it would take 0.2 s
 
     @property
     def calibrating(self) -> bool:
@@ -104,7 +109,7 @@ class CalibrationSession:
 
     def drop(self, counts: Mapping[str, int]) -> None:
         """Take note of messages of some kinds that came, and were dropped."""
-        self._situation.dropped.update(counts)
+        self._situation.dropped.counts.update(counts)
 
     def keep(self, kind: str, octets: bytes) -> None:
         """Record a message, as no time is left to collect it."""
@@ -124,6 +129,9 @@ class CalibrationSession:
     def request(self, name: str) -> tuple[bool, str]:
         """Serve a request; return whether that succeeded, and the answer."""
         try:
+            if name != 'stop' and self.calibrating:
+                raise InputError(f'~/{name}', 'a calibration under way', 'none',
+                                 'wait for it, or call ~/stop first')
             answer = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
                       'discard_last': self._discard_last}[name]()
         except Exception as error:
@@ -143,19 +151,25 @@ class CalibrationSession:
         self._tell_dropped()
         self._start_by_itself()
         self._appraise()
-        # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
-        period = 1.0 + 0.1 * self._collector.count
-        if self._situation.markers.wanted and not self.behind and self._collector.count \
-                and self._clock() - self._situation.markers.last >= period:
-            self._show()
+        if not self.behind:
+            self._show(at_once=False)
         self._report()
 
-    def take_options(self) -> Options:
-        """Return the options in force, with which the messages so far are collected anew if they changed."""
-        options = self._graph.options()
-        if options != self._collected_with:
-            self._collector, self._collected_with = self._collector.with_options(options), options
-        return options
+    def change_options(self) -> None:
+        """Take note of the options in force; `collect_anew` collects the messages so far with them."""
+        self.collecting.change(self._graph.options())
+
+    def collect_anew(self) -> None:
+        """Collect one message anew; others wait until none of `collecting` is left."""
+        if self.collecting.step():
+            self._tell_news()
+
+    def _take_options(self) -> Options:
+        """Return the options in force, with which all messages so far are collected."""
+        self.change_options()
+        while self.collecting.left:
+            self.collect_anew()
+        return self.collecting.options
 
     def fail(self, text: str, *log: str) -> None:
         """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
@@ -193,13 +207,16 @@ class CalibrationSession:
             self._order.check(message)
             self._order.add(message)
             self._collector.add(message)
-            for refusal in (*self._collector.take_news(), *self._collector.take_doubts()):
-                self.refuse(str(refusal))
-            for early in self._collector.take_early():
-                self._graph.info(f'{early.thing}: came before the first initial chain; not used')
+            self._tell_news()
         except Exception as error:
             return why(error, message.kind)
         return ''
+
+    def _tell_news(self) -> None:
+        for refusal in (*self._collector.take_news(), *self._collector.take_doubts()):
+            self.refuse(str(refusal))
+        for early in self._collector.take_early():
+            self._graph.info(f'{early.thing}: came before the first initial chain; not used')
 
     def clock_went_back(self, before: int, now: int) -> None:
         """Begin another session, as the node's clock went from one time [ns] back to another."""
@@ -211,7 +228,7 @@ class CalibrationSession:
         """Begin another session because the clock went back."""
         self._order, self._began = self._order.after_jump(), self._clock()
         if self._situation.heard == float('-inf'):  # only initial chains came: there is no session to keep
-            self._collector.clear()
+            self.collecting = Collecting(self._graph.options())
             self._graph.warn(why)
             return
         count, folder = self._collector.count, self._recorder.folder
@@ -221,14 +238,9 @@ class CalibrationSession:
 
     # Requests
 
-    def _require_idle(self, service: str) -> None:
-        if self.calibrating:
-            raise InputError(service, 'a calibration under way', 'none', 'wait for it, or call ~/stop first')
-
     def _start(self) -> str:
-        self._require_idle('~/start')
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
-        options = self.take_options()
+        options = self._take_options()
         known = set(self._situation.refusals)
         for problem in self._collector.problems:
             if str(problem) not in known:
@@ -249,14 +261,14 @@ class CalibrationSession:
         self._appraiser.stop()
         situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
         self._worker.start(trials, options, log, self._compiling.wait)
-        later = '' if compiled else 'It begins when the simulation is compiled, in half a minute or less.'
-        words = ' '.join(filter(None, [choice.words, later]))
-        return f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations' \
-               f'{f". {words}" if words else ""}'
+        return ' '.join(filter(None, [
+            f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations.', choice.words,
+            '' if compiled else 'It begins when the simulation is compiled, in half a minute or less.']))
 
     def _start_by_itself(self) -> None:
         situation, wanted = self._situation, self._graph.options().start_after_trials
-        if self.calibrating or situation.started or not 0 < wanted <= self._collector.count:
+        if self.calibrating or self.collecting.left or situation.started \
+                or not 0 < wanted <= self._collector.count:
             return
         # A trial may have many goal chains: it is complete when the next trial begins, or no message follows.
         if self._collector.count > wanted or self._clock() - situation.heard > QUIET:
@@ -274,14 +286,13 @@ class CalibrationSession:
         return 'the search ends now; the best so far will be the result'
 
     def _reset(self) -> str:
-        self._require_idle('~/reset')
         self._order = StampOrder()
         self._forget()
         return 'the trials are forgotten'
 
     def _discard_last(self) -> str:
-        self._require_idle('~/discard_last')
         self._graph.hear_waiting()  # messages sent before the request belong to that trial
+        self._take_options()
         before = self._collector.count
         self._recorder.taken_back(*self._collector.take_back())
         situation, count = self._situation, self._collector.count
@@ -297,8 +308,7 @@ class CalibrationSession:
         self._tell_dropped(at_once=True)
         self._recorder.end()
         self._appraiser.stop()
-        self._collected_with = self._graph.options()
-        self._collector = TrialCollector(self._collected_with)
+        self.collecting = Collecting(self._graph.options())
         self._tell_refusals(self._situation.counted.rest())
         self._situation = Situation(state='calibrating' if self.calibrating else 'collecting')
         self._began = self._clock()
@@ -337,9 +347,7 @@ class CalibrationSession:
         self._graph.info(diagnostics.in_one_line(event))
         for warning in event.warnings:
             self._graph.warn(warning)
-        self._outlet.send('result', diagnostics.result(self._types, event, self._graph.stamp()))
-        self._outlet.send('dlo_description', self._types.build(
-            OUTPUT_TYPES['dlo_description'], data=description_document(event, options.flat()).decode()))
+        self._outlet.result(event, options)
         if older := self._recorder.result(event, options):
             self._graph.info(older)
         self._recorder.finish(interrupted=self._worker.stopped)
@@ -363,22 +371,17 @@ class CalibrationSession:
 
     def _tell_dropped(self, at_once: bool = False) -> None:
         """Tell how many messages were dropped, if that number has changed, at most once a second."""
-        situation, now = self._situation, self._clock()
-        if situation.dropped != situation.told_dropped and (at_once or now - situation.telling.last > 1.0):
-            situation.telling.last = now
-            for kind, count in (situation.dropped - situation.told_dropped).items():
-                self._graph.warn(f'{kind}: {count} message(s) were dropped, as they came faster than they '
-                                 'can be read; publish fewer a second')
-            situation.told_dropped = Counter(situation.dropped)
-            self._recorder.dropped(situation.dropped)
+        if texts := self._situation.dropped.due(self._clock(), at_once):
+            self._tell_refusals(texts)
+            self._recorder.dropped(self._situation.dropped.told)
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        self._outlet.status(self._situation, self._collector, self._compiling.under_way)
+        self._outlet.status(self._situation, self._collector,
+                            self.collecting.words or self._compiling.under_way)
 
-    def _show(self) -> None:
-        """Send the markers of all trials."""
-        self._outlet.markers(self._situation, self._collector)
+    def _show(self, at_once: bool = True) -> None:
+        self._outlet.markers(self._situation, self._collector, at_once)
 
     def _begin_recording(self) -> None:
         self._recorder.begin(self._graph.options())

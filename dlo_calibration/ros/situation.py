@@ -30,6 +30,29 @@ class Pace:
 
 
 @dataclass
+class Dropped:
+    """
+    Messages that were dropped.
+
+    :param counts: how many of each kind.
+    :param told: how many of them have been told, when last at the time `last` [s].
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    told: Counter[str] = field(default_factory=Counter)
+    last: float = float('-inf')
+
+    def due(self, now: float, at_once: bool) -> list[str]:
+        """Return, once, what is to be told at the time `now` [s], at most once a second."""
+        new = self.counts - self.told
+        if not new or not at_once and now - self.last <= 1.0:
+            return []
+        self.told, self.last = Counter(self.counts), now
+        return [f'{kind}: {count} message(s) were dropped, as they came faster than they can be read; '
+                'publish fewer a second' for kind, count in new.items()]
+
+
+@dataclass
 class Situation:
     """
     What a reset forgets, besides the trials.
@@ -41,7 +64,6 @@ class Situation:
     :param started: whether a calibration was started, so that `start_after_trials` starts none.
     :param result: of the last calibration.
     :param information: about the newest trial that was appraised.
-    :param dropped: how many messages of each kind were dropped; `told_dropped`: as told `telling.last`.
     """
 
     state: str = 'collecting'
@@ -53,9 +75,7 @@ class Situation:
     started: bool = False
     result: CalibrationResult | None = None
     information: TrialInformation | None = None
-    dropped: Counter[str] = field(default_factory=Counter)
-    told_dropped: Counter[str] = field(default_factory=Counter)
-    telling: Pace = field(default_factory=Pace)
+    dropped: Dropped = field(default_factory=Dropped)
     markers: Pace = field(default_factory=Pace)
     appraisal: Pace = field(default_factory=Pace)
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from trial_contents import contents
+from trial_contents import anew, contents
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
@@ -107,14 +107,6 @@ def test_two_hands_may_send_actions_of_their_own_at_one_instant():
     assert [hand.name for hand in trial.hands] == ['left_hand', 'right_hand']
 
 
-def test_clear_forgets_all():
-    collector = collect(initial(1), action(2), goal(5))
-    collector.clear()
-    assert (collector.trials, collector.count, collector.incomplete, collector.problems) == ((), 0, '', ())
-    collector.add(initial(1, frame='map'))
-    assert 'action' in collector.incomplete
-
-
 # ---- the start
 
 def test_last_initial_chain_in_a_row_is_where_the_dlo_is():
@@ -170,11 +162,11 @@ def test_clock_never_shows_a_negative_time():
 def test_other_options_judge_the_same_messages_again():
     collector = collect(initial(1), action(2), goal(5))
     refused(collector, goal(6, length=1.7))
-    wide = collector.with_options(Options(length_tolerance=100.0, release=False))
+    wide = anew(collector, Options(length_tolerance=100.0, release=False))
     assert [g.held_by for g in wide.trials[0].goals] == [('left_hand',)] * 2
     assert wide.problems == ()
     assert [len(t.goals) for t in collector.trials] == [1]
-    assert contents(wide.with_options(Options()).trials) == contents(collector.trials)
+    assert contents(anew(wide, Options()).trials) == contents(collector.trials)
     assert "expected 'world'" in refused(wide, initial(8, frame='map'))
 
 
@@ -190,7 +182,7 @@ def test_the_newest_trial_is_taken_back_complete_or_not_and_what_a_tracker_sends
     alone = contents(collect(*FIRST).trials)
     for message in (goal(16), goal(13, move=0.1), action(17), initial(11.5)):
         collector.add(message)
-        assert contents(collector.trials) == contents(collector.with_options(Options()).trials) == alone
+        assert contents(collector.trials) == contents(anew(collector, Options()).trials) == alone
     assert (collector.incomplete, collector.problems, collector.loose_end) == ('', (), ())
     for message in (initial(21), action(22), goal(25)):
         collector.add(message)
@@ -536,8 +528,6 @@ def test_what_is_too_much_is_refused_after_what_no_trial_uses_is_forgotten(monke
     assert collector.problems == ()
     assert 'calibrate with these, or reset' in refused(collector, goal(60))
     assert [len(t.goals) for t in collector.trials] == [18]
-    collector.clear()
-    collector.add(initial(61))
 
 
 # ---- any order of arrival

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from resting import trial_of
+from trial_contents import anew
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.files.request import read_request, request_trials
@@ -138,7 +139,7 @@ def test_the_collector_tells_it_once_when_the_trial_is_complete(lying):
     assert [text.split(':')[0] for _, text in told] == ['trial 1', 'trial 2']
     assert collector.take_doubts() == ()
     assert collector.count == 2
-    right = collector.with_options(Options(table_height=0.75))
+    right = anew(collector, Options(table_height=0.75))
     assert right.take_doubts() == ()
 
 

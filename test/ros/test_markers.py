@@ -18,7 +18,7 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.trial import Goal
-from dlo_calibration.ros.markers import error_colour, markers, MOST_POINTS
+from dlo_calibration.ros.markers import alike, error_colour, markers, MOST_POINTS
 from dlo_calibration.search import RandomSearch
 
 STAMP = 12_500_000_000
@@ -127,6 +127,19 @@ def test_a_tracker_that_goes_on_after_the_result_does_not_hide_what_was_simulate
     calibrated = replace(result, trials=tuple(streamed(trial, 40) for trial in result.trials))
     found = shown(types, [streamed(trial, 50) for trial in toy_trials(2)], calibrated)
     assert 'trial_2/simulated' in found
+
+
+def test_only_the_mean_of_a_stream_may_differ_between_trials_that_look_alike():
+    trial, other = toy_trials(2)
+
+    def seen(trial, count, move=0.0):
+        return replace(trial, goals=tuple(replace(goal, chain=Chain(goal.chain.points + move), count=count)
+                                          for goal in trial.goals))
+
+    assert alike([seen(trial, 30), other], [seen(trial, 31, 1e-5), replace(other, name='trial 9')])
+    assert not alike([seen(trial, 1)], [seen(trial, 1, 1e-5)])
+    assert not alike([trial], [trial, other])
+    assert not alike([trial], [replace(trial, initial=Chain(trial.initial.points + 0.1))])
 
 
 def test_same_thing_has_the_same_id_in_every_message_and_no_two_share_one(types, result):

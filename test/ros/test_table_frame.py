@@ -3,6 +3,7 @@
 
 """Where frame_pose names the table's frame, the node takes the pose from tf2, and messages wait for it."""
 
+import re
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -78,3 +79,28 @@ def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path
         robot.send(trial_messages(robot_types(), lifted[1], 2 * MINUTE))
         robot.until_status(trials='2')
         assert 'trial 2' not in robot.status['last_refusal']
+
+
+def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_it(
+        ros_environment, tmp_path, monkeypatch):
+    from rclpy.parameter import Parameter
+
+    from dlo_calibration.ros import calibrator_node
+
+    lifted = Pose([0.0, 0.0, 0.75], [0.0, 0.0, 0.0, 1.0]).trial(toy_trials(1)[0])
+    with live_node(ros_environment, tmp_path) as robot:
+        pairs = trial_messages(robot_types(), lifted, MINUTE)
+        robot.send(pairs)
+        for k in range(1, 201):
+            pairs[-1][1].header.stamp.nanosec = 4_000_000 * k
+            robot.send(pairs[-1:])
+        robot.until(lambda: len(robot.calibrator.session.collecting.collector._known) == len(pairs) + 200)
+        monkeypatch.setattr(calibrator_node, 'SLICE', 1e-4)
+        monkeypatch.setattr(calibrator_node, 'ANSWER', 1e-4)
+        pose = Parameter('frame_pose', value='0 0 -0.75 0 0 0 1')
+        assert robot.calibrator.set_parameters([pose])[0].successful
+        answer = robot.call('start')
+        assert answer.success
+        assert re.fullmatch('[0-9]+ messages came before; start follows when they are read', answer.message)
+        robot.until_result()
+        assert robot.calibrator.session.collecting.collector.trials[0].initial.points[:, 2].max() < 0.5
