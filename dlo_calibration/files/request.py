@@ -42,6 +42,7 @@ from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, length_change
 from dlo_calibration.model.manipulation import in_steps, Manipulation, PATHS, Timed
 from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal, Trial
 
 WHAT = 'request'  # in errors
@@ -100,6 +101,15 @@ class TrialRequest:
         """Return the request for an observed trial."""
         goals = tuple(GoalRequest(one.chain, one.time, one.stable, one.held_by) for one in trial.goals)
         return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
+
+    def moved(self, pose: Pose) -> TrialRequest:
+        """Return the trial in the table's frame, in which the frame of the request has a pose."""
+        return replace(
+            self, initial=pose.chain(self.initial), actions=tuple(
+                pose.action(one) if isinstance(one, Action) else pose.named_action(one)
+                for one in self.actions),
+            goals=tuple(replace(goal, chain=pose.chain(goal.chain)) for goal in self.goals),
+            velocity=None if self.velocity is None else pose.vectors(self.velocity))
 
     def trial(self, release: bool = True) -> Trial:
         """
@@ -265,11 +275,7 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
                 f'trial {one.name!r}', 'no goal chain', 'at least one',
                 'observe the DLO after the action, or predict it with dlo-calibration simulate')))
             continue
-        if pose is not None and not pose.upright and (named := _named(one)):
-            refusals.append(str(named))
-            continue
-        trial = one.trial(options.release)
-        trial = trial if pose is None else pose.trial(trial)
+        trial = (one if pose is None else one.moved(pose)).trial(options.release)
         change = max(length_change(trial.initial, goal.chain) for goal in trial.goals)
         if change > options.length_tolerance:
             refusals.append(str(InputError(
@@ -286,22 +292,10 @@ def request_manipulations(request: Request, options: Options) -> tuple[Manipulat
     Return what the hands do in each trial of a request, with or without goal chains.
 
     :param options: `release` and `frame_pose` are used.
-    :raises InputError: for a named action with a `frame_pose`: it begins where the DLO is predicted.
     """
-    found, pose = [one.manipulation(options.release) for one in request.trials], options.pose
-    if pose is None:
-        return tuple(found)
-    for named in filter(None, map(_named, request.trials)):
-        raise named
-    return tuple(map(pose.manipulation, found))
-
-
-def _named(trial: TrialRequest) -> InputError | None:
-    """Return why the actions of a trial cannot be moved to another frame; None: they can."""
-    name = next((one.name for one in trial.actions if isinstance(one, NamedAction)), None)
-    return None if name is None else InputError(
-        f'trial {trial.name!r}', f'the action {name} with a frame_pose', 'hand_paths, as a named action '
-        "needs the table's frame", "give the paths of the hands, or all chains in the table's frame")
+    pose = options.pose
+    return tuple((one if pose is None else one.moved(pose)).manipulation(options.release)
+                 for one in request.trials)
 
 
 def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:

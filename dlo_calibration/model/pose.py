@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Action, far_from_unit, Hand, quaternion_lengths
 from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
-from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.model.named_actions import NamedAction
 from dlo_calibration.model.trial import Trial
 
 NUMBERS = 'x y z qx qy qz qw'
@@ -74,11 +74,6 @@ class Pose:
         """The pose of the other frame in this one."""
         return Pose(-self.position @ self.rotation, self.orientation * [-1.0, -1.0, -1.0, 1.0])
 
-    @property
-    def upright(self) -> bool:
-        """Whether z is up in both frames."""
-        return bool(self.rotation[2, 2] > 1 - 1e-9)
-
     def points(self, points: Floats) -> Floats:
         """Return (..., 3) points of the frame in the other one [m]."""
         return np.asarray(points @ self.rotation.T + self.position)
@@ -100,16 +95,19 @@ class Pose:
     def trial(self, trial: Trial) -> Trial:
         """Return a trial of the frame in the other one."""
         return replace(
-            trial, initial=self.chain(trial.initial), actions=tuple(map(self._action, trial.actions)),
+            trial, initial=self.chain(trial.initial), actions=tuple(map(self.action, trial.actions)),
             goals=tuple(replace(goal, chain=self.chain(goal.chain)) for goal in trial.goals),
             velocity=None if trial.velocity is None else self.vectors(trial.velocity))
 
-    def manipulation(self, one: Manipulation) -> Manipulation:
-        """Return a manipulation of the frame, with explicit paths only, in the other one."""
-        return replace(one, start=self.chain(one.start), steps=tuple(
-            replace(step, actions=tuple(self._action(action) if isinstance(action, Action) else action
-                                        for action in step.actions)) for step in one.steps))
-
-    def _action(self, action: Action) -> Action:
+    def action(self, action: Action) -> Action:
+        """Return the paths of hands of the frame in the other one."""
         return Action(tuple(Hand(hand.name, hand.grips, hand.times, self.points(hand.positions),
                                  self.orientations(hand.orientations), hand.offset) for hand in action.hands))
+
+    def named_action(self, action: NamedAction) -> NamedAction:
+        """Return a named action of the frame, to be done in the other one, whose z is then up."""
+        moved: dict[str, Any] = {
+            name: tuple(move(np.array(given)).tolist())
+            for name, move in (('to', self.points), ('direction', self.vectors))
+            if (given := getattr(action, name, None)) is not None}
+        return replace(action, **moved)

@@ -42,11 +42,11 @@ class PlanOptions(DeclaredOptions):
                              unit='m', minimum=0.001, maximum=10.0, of=MACHINE)
     speed: float = declared(0.1, 'speed of the hands', unit='m/s', minimum=0.001, maximum=10.0, of=MACHINE)
     reach_1: str = declared(
-        '', f'where hand_1 can be: {REACH}, in the frame of the chains; empty: everywhere', of=MACHINE)
+        '', f'where hand_1 can be: {REACH}, in the frame of the table; empty: everywhere', of=MACHINE)
     reach_2: str = declared('', 'where hand_2 can be, as reach_1', of=MACHINE)
     no_go: tuple[str, ...] = declared(
         (), "boxes that neither a hand nor the DLO may enter, each 'x0 y0 z0 x1 y1 z1', two opposite corners "
-        'in metres in the frame of the chains; they should be larger than what they protect by the size of '
+        'in metres in the frame of the table; they should be larger than what they protect by the size of '
         'the gripper, as a hand counts as a point', of=MACHINE)
     workers: int = declared(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)

@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.pose import Pose
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,18 @@ class PlannedAction:
     predicted: Floats
     lower: Floats
     upper: Floats
+
+
+    def moved(self, pose: Pose) -> PlannedAction:
+        """
+        Return the action in another frame, in which its own has a pose.
+
+        The errors of the coordinates count as independent: their intervals add up in squares.
+        """
+        predicted, squares = pose.points(self.predicted), pose.rotation.T**2
+        lower, upper = (np.sqrt((end - self.predicted)**2 @ squares) for end in (self.lower, self.upper))
+        return replace(self, action=pose.action(self.action), predicted=predicted, lower=predicted - lower,
+                       upper=predicted + upper)
 
 
 @dataclass(frozen=True)
@@ -64,3 +79,8 @@ class Plan:
     seed: int
     stop_reason: str
     remarks: tuple[str, ...] = ()
+
+    def moved(self, pose: Pose) -> Plan:
+        """Return the plan in another frame, in which its own has a pose."""
+        return replace(self, start=pose.chain(self.start), goal=pose.chain(self.goal),
+                       actions=tuple(action.moved(pose) for action in self.actions))

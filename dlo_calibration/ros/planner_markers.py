@@ -11,6 +11,7 @@ import numpy as np
 
 from dlo_calibration.messages.codec import MessageTypes
 from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.ros.markers import (
@@ -27,17 +28,20 @@ from dlo_calibration.ros.markers import (
 MARKERS_TYPE = 'visualization_msgs/msg/MarkerArray'
 
 
-def plan_markers(types: MessageTypes, plan: Plan, *, stamp: int, frame_id: str) -> Any:
+def plan_markers(types: MessageTypes, plan: Plan, *, stamp: int, frame_id: str,
+                 pose: Pose | None = None) -> Any:
     """
     Build the message that shows a plan; it replaces everything that earlier messages show.
 
     Namespaces are ``plan/start``, ``/goal``, ``/label``, and for each action ``action_1/predicted``,
     ``/interval``, ``/hands``, ``/label``.  The colour of a prediction goes from that of the start to
     orange.  An interval is a cross at each point: the 90 % intervals of its coordinates.
+
+    :param pose: of the plan's frame in that of `frame_id`; None: they are the same.
     """
     header = types.header(stamp, frame_id)
     thickness = 0.01 * plan.start.length
-    brush = Brush(types, header, 'plan', thickness)
+    brush = Brush(types, header, 'plan', thickness, pose)
     built = [cleared(types, header), brush.line('start', 0, plan.start.points, INITIAL_COLOUR),
              brush.spheres('goal', 0, plan.goal.points, [GOAL_COLOUR], 1.2),
              brush.line('goal', 1, plan.goal.points, GOAL_COLOUR, 0.5),
@@ -46,7 +50,7 @@ def plan_markers(types: MessageTypes, plan: Plan, *, stamp: int, frame_id: str) 
     for k, action in enumerate(plan.actions):
         red, green, blue = np.add(np.multiply((k + 1) / len(plan.actions), SIMULATED_COLOUR),
                                   np.multiply(1 - (k + 1) / len(plan.actions), INITIAL_COLOUR)).tolist()
-        brush = Brush(types, header, f'action_{k + 1}', thickness)
+        brush = Brush(types, header, f'action_{k + 1}', thickness, pose)
         built += _action_markers(brush, action, before, k, (red, green, blue))
         before = action.predicted
     return types.build(MARKERS_TYPE, markers=built)

@@ -11,6 +11,7 @@ from typing import Any, Mapping
 from dlo_calibration.calibration.declaration import Declaration, declared, MACHINE
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.planning.options import PlanOptions
 
 PLAN, PUBLISH = 'plan', 'publish'  # modes
@@ -22,7 +23,7 @@ WORDS = {'true': True, 'false': False}
 
 @dataclass(frozen=True)
 class PlannerOptions(PlanOptions):
-    """Everything that a user of the node can set; `description`, `mode` and `simulation` are its own."""
+    """Everything that a user of the node can set, with what a plan alone does not have."""
 
     description: str = declared(
         '', 'path of the result.xml of the DLO, relative to the working directory, which the node then '
@@ -30,17 +31,23 @@ class PlannerOptions(PlanOptions):
     mode: str = declared(
         PLAN, 'what the node does: plan makes plans; publish only serves the description on '
         '~/dlo_description, latched, as robot_description is served', choices=(PLAN, PUBLISH), of=MACHINE)
+    frame_pose: str = declared(
+        '', "pose of the chains' frame in the table's frame, whose z is up: x y z [m] and a quaternion qx qy "
+        'qz qw; plans are in the frame of the chains, too, while reach and no_go are in that of the table; '
+        'empty: that of the description, with which the calibrator read the chains', of=MACHINE)
     simulation: tuple[str, ...] = declared(
         (), "options of the simulation that replace those of the description, each 'name=value', e.g. "
         f"'table_height=0.72'; the names are {', '.join(SIMULATION)}", of=MACHINE)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.frame_pose:
+            Pose.of(self.frame_pose)
         self.replacing()
 
     def replacing(self) -> Mapping[str, Any]:
         """
-        Return the options of the simulation that replace those of the description, by name.
+        Return the options that replace those of the description, by name.
 
         :raises InputError: for an unknown name or a bad value.
         """
@@ -53,7 +60,7 @@ class PlannerOptions(PlanOptions):
                                  f'{", ".join(SIMULATION)}', 'correct it')
             found[name] = _read(known[name], value)
         Options.of(found)
-        return found
+        return {**found, 'frame_pose': self.frame_pose} if self.frame_pose else found
 
     def check_together(self) -> None:
         """

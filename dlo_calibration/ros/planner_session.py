@@ -24,6 +24,7 @@ from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
 from dlo_calibration.messages.refusals import Refusals
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.planning.checks import checked
 from dlo_calibration.planning.plain import plain_plan
 from dlo_calibration.planning.plan import Plan
@@ -127,6 +128,7 @@ class PlannerSession:
         self._plan: Plan | None = None
         self._plans, self._under_way = 0, False
         self._frame_id = ''  # of the chains that are planned with
+        self._back: Pose | None = None  # of the table's frame in that of the chains
         self._compiling.begin()
         self._report()
 
@@ -251,11 +253,13 @@ class PlannerSession:
                              f'that of the chain, {start.frame_id!r}', 'send both in one frame')
         options = self._graph.options()
         simulation = _simulation(found, options)
-        checked(found, start.chain, goal.chain, simulation, options)
+        pose = simulation.pose
+        begin, end = (chain.chain if pose is None else pose.chain(chain.chain) for chain in (start, goal))
+        checked(found, begin, end, simulation, options)
 
         def work(should_stop: Callable[[], bool]) -> Event:
             executor = self._processes.ready(simulation, options.workers, should_stop)
-            return self._find(found, start.chain, goal.chain, options, simulation=simulation,
+            return self._find(found, begin, end, options, simulation=simulation,
                               on_progress=self._background.events.put, should_stop=should_stop,
                               make_simulator=self._make_simulator, executor=executor)
 
@@ -263,6 +267,7 @@ class PlannerSession:
         self._background.begin(work)
         self._state, self._detail, self._frame_id, self._under_way = PLANNING, FIRST, start.frame_id, True
         self._plan, self._progress, self._plans = None, None, self._plans + 1
+        self._back = None if pose is None else pose.inverse
         age = self._clock() - self._chains[CHAIN].came
         return f'plan {self._plans} begins, from the {start}, which came {age:.1f} s ago, to the {goal}'
 
@@ -299,12 +304,13 @@ class PlannerSession:
     def _finish(self, plan: Plan) -> None:
         if self._progress is not None:
             self._send_progress()
-        stamp = self._graph.stamp()
-        self._send(STEPS, self._types.build(OUTPUT_TYPES[STEPS], data=json.dumps(plain_plan(plan))))
-        self._send('markers', plan_markers(self._types, plan, stamp=stamp, frame_id=self._frame_id))
+        stamp, sent = self._graph.stamp(), plan if self._back is None else plan.moved(self._back)
+        self._send(STEPS, self._types.build(OUTPUT_TYPES[STEPS], data=json.dumps(plain_plan(sent))))
+        self._send('markers', plan_markers(self._types, plan, stamp=stamp, frame_id=self._frame_id,
+                                           pose=self._back))
         if plan.actions:
             # With use_sim_time and no /clock, the node's time is 0, which is no stamp of an action.
-            message = action_message(plan.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)
+            message = action_message(sent.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)
             self._send(ACTION, action_trajectory(self._types, message))
         self._state, self._plan = DONE, plan
         self._detail = outcome(plan) if plan.reached else f'{outcome(plan)} The search: {plan.stop_reason}.'

@@ -20,7 +20,7 @@ from dlo_calibration.files.request import (
     write_request,
 )
 from dlo_calibration.files.session import read_session, session_manipulations, trial_records
-from dlo_calibration.model.named_actions import LiftAndHold
+from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, TwoHands
 from dlo_calibration.model.pose import Pose
 
 CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])  # in the table's frame
@@ -74,15 +74,26 @@ def test_a_request_and_the_flag(tmp_path, seen, command):
     assert 'only the node looks up' in errors[-1]
 
 
-def test_a_named_action_needs_a_frame_whose_z_is_up(seen):
-    lift = LiftAndHold(point=0, height=0.1)
-    request = Request((replace(TrialRequest.of(seen[0]), actions=(lift,)),))
-    trials, refusals = request_trials(request, Options(frame_pose=TEXT))
-    assert trials == ()
-    assert 'the action lift_and_hold with a frame_pose' in refusals[0]
-    assert len(request_trials(request, Options(frame_pose='0 0 -0.75 0 0 1 0'))[0]) == 1
-    with pytest.raises(InputError, match='lift_and_hold'):
-        request_manipulations(request, Options(frame_pose=TEXT))
+@pytest.mark.parametrize('action', [
+    LiftAndHold(point=0, speed=1.0), GraspAndPlace(point=1, direction=(1, 2, 0), distance=0.1, speed=1.0),
+    Drag(fraction=0.9, to=(0.3, 0.1, 0.0), speed=1.0), TwoHands(points=(0, -1), height=0.05, speed=1.0)],
+    ids=lambda action: action.name)
+def test_a_named_action_is_done_in_the_frame_of_the_table(action):
+    level = replace(TrialRequest.of(toy_trials(1)[0]), actions=(action,))
+    camera = CAMERA.inverse
+    aim = {name: tuple(move(np.array(value)).tolist())
+           for name, move in (('to', camera.points), ('direction', camera.vectors))
+           if (value := getattr(action, name, None)) is not None}
+    tilted = Request((replace(TrialRequest.of(camera.trial(toy_trials(1)[0])),
+                              actions=(replace(action, **aim),)),))
+    (trial,), refusals = request_trials(tilted, Options(frame_pose=TEXT))
+    assert refusals == ()
+    for hand, right in zip(trial.hands, level.trial().hands, strict=True):
+        assert np.allclose(hand.positions, right.positions, atol=1e-12)
+    found, = request_manipulations(tilted, Options(frame_pose=TEXT))
+    right = level.manipulation()
+    path, = (step.actions[0].action(right.start) for step in found.steps)
+    assert np.allclose(path.hands[0].positions, trial.hands[0].positions)
 
 
 @pytest.mark.parametrize('text', ['0 0 1', '0,0,1,0,0,0,1', '7seven'])

@@ -24,8 +24,6 @@ def test_points_vectors_and_orientations_are_those_of_scipy():
     turned = Rotation.from_quat(POSE.orientations(other.as_quat()))
     assert np.allclose(turned.as_matrix(), (TURN * other).as_matrix())
     assert np.allclose(POSE.inverse.points(POSE.points(points)), points)
-    assert not POSE.upright
-    assert Pose([0, 0, 1], Rotation.from_euler('z', 2.0).as_quat()).upright
 
 
 def test_text_of_a_pose_reads_back_exactly():

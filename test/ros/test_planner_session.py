@@ -15,10 +15,12 @@ from dlo_calibration import Chain, InputError
 from dlo_calibration.files.result import description_document, read_result
 from dlo_calibration.messages.codec import ACTION, chain_cloud, ChainMessage, GOAL, INITIAL, read
 from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.planning.plain import plain_plan
 from dlo_calibration.ros.planner_options import PlannerOptions
 
 MOVED = Chain(CHAIN.points + (0.1, 0.0, 0.0))
+CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])  # in the table's frame
 
 
 @pytest.fixture
@@ -93,6 +95,45 @@ def test_the_calibrator_reads_the_published_action_as_that_of_the_plan(started):
     trial, = collector.trials
     collected, = trial.hands
     assert collected.grips == (hand['grip'],)
+
+
+def test_with_a_frame_pose_chains_and_plans_are_in_the_frame_of_the_camera(started):
+    plan, level = ToyPlan(), started()
+    level.send_chains(CHAIN, MOVED)
+    level.planned()
+    graph = started(plan, frame_pose=str(CAMERA))
+    graph.send_chains(CAMERA.inverse.chain(CHAIN), CAMERA.inverse.chain(MOVED), frame_id='camera')
+    graph.planned()
+    (_, start, goal, *_), = plan.calls
+    assert np.allclose(start.points, CHAIN.points) and np.allclose(goal.points, MOVED.points)
+    for one, right in zip(graph.steps[0]['actions'], level.steps[0]['actions'], strict=True):
+        for key in ('predicted', 'waypoints'):
+            found, true = (np.array(each[key] if key in each else each['hands'][0][key])[:, -3:]
+                           for each in (one, right))
+            assert np.allclose(CAMERA.points(found), true)
+        lower, upper = np.array(one['predicted_lower_upper_m'])
+        assert (lower <= one['predicted']).all() and (upper >= one['predicted']).all()
+        true = np.linalg.norm(np.subtract(*right['predicted_lower_upper_m']), axis=1)
+        assert np.allclose(np.linalg.norm(upper - lower, axis=1), true)
+    heard, right = (read(ACTION, one.heard['action'][0]) for one in (graph, level))
+    assert heard.frame_id == 'camera'
+    assert np.allclose(CAMERA.points(heard.positions), right.positions)
+    line, = (one for one in graph.heard['markers'][0].markers if one.ns == 'plan/start')
+    at, turn = line.pose.position, line.pose.orientation
+    seen = Pose([at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w]).points(
+        np.array([[p.x, p.y, p.z] for p in line.points]))
+    assert np.allclose(seen, CAMERA.inverse.points(CHAIN.points))
+
+
+def test_without_a_frame_pose_the_description_tells_how_its_chains_were_read(started):
+    plan, text = ToyPlan(), RESULT.read_text(encoding='utf-8')
+    graph = started(plan)
+    graph.hear('dlo_description', description(text.replace(
+        '<options>', f'<options><option name="frame_pose" value="{CAMERA}"/>')))
+    for kind in ('chain', 'goal_chain'):
+        graph.hear(kind, cloud(CAMERA.inverse.chain(CHAIN)))
+    graph.planned()
+    assert np.allclose(plan.calls[0][1].points, CHAIN.points)
 
 
 def test_an_action_has_a_stamp_even_before_a_simulated_clock_runs(started):
