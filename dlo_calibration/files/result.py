@@ -44,7 +44,8 @@ from dlo_calibration.model.score import PointErrors
 
 WHAT = 'result file'  # in errors
 #: Attributes of the calibration, in the order of the document.
-HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason', 'choice')
+HOW = ('search', 'engine', 'seed', 'evaluations', 'simulations', 'seconds', 'stop_reason', 'choice',
+       'unusable')
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,11 @@ class Description:
     :param correlations: of each pair of found parameters, by name, -1 to 1; None: they are unknown.
     :param options: options of the calibration, by name; empty where they were not given.
     :param choice: which parameters `calibrate` auto has chosen, and why; empty where they were named.
+    :param unusable: why the parameters should not be used, in words; empty: they can be.
     :param trials: names of the trials.
     :param scores: difference score of each trial [cm].
     :param confirmation: fit of a second engine with the same parameters; None: there was no second engine.
-    :param problems: a text for each option in the file that is left out.
+    :param problems: a text for each option in the file that is left out, and one if it should not be used.
     :param refusal: why the scene in the file is not among the options.
     """
 
@@ -86,6 +88,7 @@ class Description:
     correlations: Mapping[str, Mapping[str, float]] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     choice: str = ''
+    unusable: str = ''
     warnings: tuple[str, ...] = ()
     confirmation: Confirmation | None = None
     problems: tuple[str, ...] = ()
@@ -199,7 +202,7 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
     chain, parameters, calibration = root
     fit, *second, options, warnings = calibration
     given = read_options(where, options, folder)
-    seed = calibration.get('seed')
+    seed, unusable = calibration.get('seed'), calibration.get('unusable', '')
     try:
         dlo = Description(
             parameters=_estimates(where, parameters), fixed=_fixed(where, parameters),
@@ -212,8 +215,9 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
             seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
             simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
             stop_reason=calibration.get('stop_reason'), correlations=_correlations(where, parameters),
-            options=given.values, choice=calibration.get('choice', ''),
-            problems=given.problems, refusal=given.refusal,
+            options=given.values, choice=calibration.get('choice', ''), unusable=unusable,
+            problems=(*([f'do not use this result: {unusable}'] if unusable else []), *given.problems),
+            refusal=given.refusal,
             warnings=tuple(warning.get('text') for warning in warnings),
             confirmation=_confirmation(where, second[0]) if second else None)
         space = dlo.space

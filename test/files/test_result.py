@@ -139,6 +139,17 @@ def test_document_is_for_people_too(file):
     assert any(re.fullmatch(r' +<found name="flexibility" value="[0-9.]+".*/>', line) for line in lines)
 
 
+def test_a_result_that_should_not_be_used_says_so_wherever_it_is_read(tmp_path, result):
+    doubted = replace(result, doubts=('trial 1: got a DLO on the Moon',))
+    write_result(tmp_path / 'doubted.xml', doubted, OPTIONS.flat())
+    found = read_result(tmp_path / 'doubted.xml')
+    assert found.unusable == doubted.unusable == doubted.doubts[0]
+    assert found.problems == (f'do not use this result: {doubted.doubts[0]}',)
+    sound = Description.of(replace(result, choice=None))
+    assert sound.unusable == ''
+    assert read_description(description_document(sound)).problems == ()
+
+
 @settings(max_examples=40)
 @given(text=st.text(max_size=30), value=st.floats(0, 100), length=st.floats(1e-6, 1e6))
 def test_any_text_and_number_survives(tmp_path_factory, result, text, value, length):
