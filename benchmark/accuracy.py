@@ -28,9 +28,6 @@ HERE = Path(__file__).resolve().parent
 COMMAND = [sys.executable, '-m', 'dlo_calibration']
 MOCAP_FIT = '0,8,16,24,32,40,48,54'  # spread over the session: which ones are fitted makes a difference
 MOCAP_OTHER = '42,43,44,45,46,47,49,50,51,52,53,55'
-HANGING_PARAMETERS = 'flexibility,length_scale'
-MANY_EVALUATIONS = '400'  # of cables and wires, in as many parts as their trials support
-HANGING_NODES = '121'  # the bend at a clamp is a few centimetres long, see elastica.py
 WIRE = 1.5  # m
 
 

@@ -44,7 +44,6 @@ LEAST = 0.4  # mean logarithm of the odds below which a colour says nothing
 LOCAL = 3.0  # half widths, standard deviation of smoothing the local width along the line
 UNSEEN = 0.05  # what the width elsewhere counts there, where edges of the usual strength count 1
 DRIFT = 0.15  # cost of a change of the middle by one offset; that by two is four times as much
-RESAMPLED = 0.35  # widths, standard deviation of smoothing along the line
 
 
 @dataclass(frozen=True, eq=False)
