@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Sequence
+from types import MappingProxyType
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -184,11 +185,19 @@ class Chain:
         return self.points if self.seen.all() else frozen_array(
             np.where(self.seen[:, None], self.points, np.nan))
 
-    def put_back(self, places: Floats) -> Chain:
-        """Return the chain, its unseen points put back by arc lengths of all points, (n,) in any unit."""
+    def put_back(self, places: Floats, known: Mapping[int, Floats] = MappingProxyType({})) -> Chain:
+        """
+        Return the chain, its unseen points put back.
+
+        :param places: arc lengths of all points, (n,) in any unit.
+        :param known: where unseen points are nevertheless known to be, (3,) [m] by their index.
+        """
         if self.seen.all():
             return self
-        points = put_back(self.points, self.seen, places)
+        points, seen = np.array(self.points), np.array(self.seen)
+        for k, point in known.items():
+            points[k], seen[k] = point, True
+        points = put_back(points, seen, places)
         return self if np.array_equal(points, self.points) else replace(self, points=points)
 
     @property

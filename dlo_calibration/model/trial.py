@@ -87,10 +87,11 @@ class Trial:
                     raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
                                      f'points 0 to {n - 1}', 'correct the gripped points')
         check_ends(thing, self.initial)
-        if not self.initial.seen.all():
-            object.__setattr__(self, 'initial', self.initial.put_back(_shown_places(self.initial, goals)))
         object.__setattr__(self, 'actions', actions)
         object.__setattr__(self, 'goals', goals)
+        if not self.initial.seen.all():
+            places, held = _shown_places(self.initial, goals), self._held_places()
+            object.__setattr__(self, 'initial', self.initial.put_back(places, held))
         if self.velocity is not None:
             velocity = frozen_array(self.velocity)
             if velocity.shape != (n, 3) or not np.isfinite(velocity).all():
@@ -117,6 +118,27 @@ class Trial:
         grips = [sorted(hand.grips) for hand in self.hands if hand.times[0] <= 0]
         return tuple(sorted({a for each in grips for a, b in zip(each[:-1], each[1:], strict=True)
                              if b == a + 1}))
+
+    def _held_places(self) -> dict[int, Floats]:
+        """
+        Return where gripped points were that the initial chain does not show, (3,) [m] by their index.
+
+        Goals show them while the hand holds them, as far from the hand as before, unless it turns. Beyond the
+        last point that was seen, the curve through the others would be wrong by a few mm at an end, by which
+        the hand would then move the whole DLO to wrong places.
+        """
+        places: dict[int, Floats] = {}
+        for hand in self.hands:
+            if hand.start > self.hands[0].start or hand.start > 0 and self.velocity is not None \
+                    or hand.offset or (hand.orientations != hand.orientations[0]).any():
+                continue
+            held = [goal for goal in self.goals if any(hand is one for one in self.holding(goal))]
+            for grip in hand.grips:
+                apart = [goal.chain.points[grip] - hand.positions_at(np.array([goal.time]))[0]
+                         for goal in held if goal.chain.seen[grip]]
+                if apart and not self.initial.seen[grip]:
+                    places[grip] = hand.positions[0] + np.mean(apart, axis=0)
+        return places
 
     def holding(self, goal: Goal) -> tuple[Hand, ...]:
         """Return the hands that hold the DLO when `goal` is observed, the last of each name."""

@@ -146,6 +146,21 @@ def test_a_point_unseen_in_the_initial_chain_is_where_the_goals_show_it():
     assert replace(found, name='u').initial is found.initial
 
 
+@pytest.mark.parametrize('turned', [False, True])
+def test_a_gripped_end_that_the_initial_chain_does_not_show_is_where_goals_show_it_held(turned):
+    angle = np.linspace(0, np.pi, 8)
+    arc = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    hidden = np.where(np.arange(8)[:, None] > 0, arc, np.nan)
+    path = arc[0] + np.array([[0.005, 0, 0], [0.005, 0, 0.1]])  # the hand is beside the point
+    turns = [[0, 0, 0, 1], [0, 0, 1, 0] if turned else [0, 0, 0, 1]]
+    grip = Hand('left', (0,), [0.0, 1.0], path, turns)
+    goals = [Goal(Chain(arc + [0, 0, 0.1 * time]), time, stable=False) for time in (0.5, 1.0)]
+    found = Trial('t', Chain(hidden), (Action((grip,)),), goals)
+    apart = np.linalg.norm(found.initial.points[0] - arc[0])
+    assert apart > 0.005 if turned else apart < 1e-12
+    assert not found.initial.seen[0]
+
+
 def test_an_initial_chain_without_an_end_is_refused():
     with pytest.raises(InputError, match='whose last 2 points were not seen, expected at most one'):
         Trial('t', uneven([6, 7]), (Action((hand('left', 0.0, 1.0),)),), [Goal(uneven([0, 1]), 2.0)])
