@@ -53,7 +53,7 @@ from dlo_calibration.messages.trial_builder import Key, Message, moved, order, T
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.model.trial import Trial
 
-USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options
+USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options of messages
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
 LATE = NANOSECONDS  # that goal chains from before the first initial chain may come late [ns]
 MOST_MESSAGES = 200_000  # nearly two hours of a tracker at 30 Hz, which take about 450 MB

@@ -138,6 +138,8 @@ class TrialBuilder:
     :param until: key up to which the messages were taken back; it then stays empty. None: they were not.
     :param starts: initial chains; the last one counts, and the one before it for the velocity.
     :param waiting: messages for which an initial chain or an action is still missing.
+    :param judged: how often the number of goals had doubled, and whether one was at rest, when `doubts` last
+        looked at the trial.
     """
 
     first: Key
@@ -148,7 +150,7 @@ class TrialBuilder:
     waiting: list[Message] = field(default_factory=list)
     refused: list[tuple[Message, InputError]] = field(default_factory=list)
     trial: Trial | None = None
-    judged: tuple[int, bool] = (0, False)  # see `doubts`
+    judged: tuple[int, bool] = (0, False)
     _stretches: list[Stretch] = field(default_factory=list)
 
     @property

@@ -102,6 +102,7 @@ class CalibratorNode(GraphNode[Options]):
         if 'frame_pose' in names:
             self._frame.choose(options)
         self._changed = True
+        self._more.trigger()  # when they are in force
         if self.session.calibrating:
             self.info(f'{", ".join(names)}: takes effect at the next start')
 
@@ -134,11 +135,11 @@ class CalibratorNode(GraphNode[Options]):
 
     def _work(self, seconds: float = SLICE) -> None:
         """Collect waiting messages for some time, and see to it that the others are collected soon."""
+        if not self._in_frame():
+            return
         if self._changed:  # what comes next is judged with the new values
             self._changed = False
             self.session.change_options()
-        if not self._in_frame():
-            return
         self._working = True
         until = time.monotonic() + seconds
         try:
@@ -166,14 +167,18 @@ class CalibratorNode(GraphNode[Options]):
         return len(self._inbox) + self.session.collecting.left
 
     def _in_frame(self) -> bool:
-        """Tell whether messages can be read: they wait while the pose of their frame is missing."""
-        kind, octets = self._inbox.first
-        if not self._frame.missing or octets is None:
+        """Tell whether messages can be used: they wait while the pose of their frame is missing."""
+        if not self._frame.missing:
             return True
-        try:
-            frame = self.decode(kind, octets).header.frame_id
-        except Exception:  # the session tells why
-            return True
+        frame = self.session.collecting.collector.frame_id
+        if not frame:  # as before the first message
+            kind, octets = self._inbox.first
+            if octets is None:
+                return True
+            try:
+                frame = self.decode(kind, octets).header.frame_id
+            except Exception:  # the session tells why
+                return True
         words = self._frame.look_up(frame)
         if self._frame.missing:
             if words != self._waited:
@@ -181,7 +186,7 @@ class CalibratorNode(GraphNode[Options]):
             self._waited = words
             return False
         self.info(words)
-        self.session.change_options()
+        self._changed = True
         return True
 
     def _on_message_lost(self, kind: str, event: Any) -> None:
@@ -203,18 +208,19 @@ class CalibratorNode(GraphNode[Options]):
 
     def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.hear_waiting()
-        if name == 'stop' or not self._waiting:
+        count, ready = self._waiting, self._in_frame()
+        if name == 'stop' or ready and not count:
             response.success, response.message = self.session.request(name)
         else:
-            response.success, response.message = True, \
-                f'{self._waiting} messages came before; {name} follows when they are read'
+            why = f'{count} messages came before' if count else 'no pose of their frame came yet'
+            response.success, response.message = True, f'{why}; {name} follows when they are read'
             self._inbox.put_request(name)
         return response
 
     def act(self) -> None:
         """Do what is due now."""
         self._after_jump()
-        if self._frame.missing and len(self._inbox):
+        if self._frame.missing:
             self._work()
         self.session.drop(self._inbox.take_dropped())
         self.session.tick()

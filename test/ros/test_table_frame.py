@@ -60,6 +60,22 @@ def test_messages_wait_for_the_transform_and_are_then_in_the_tables_frame(ros_en
     assert np.allclose(session.trials[0].initial.points, trial.initial.points, atol=1e-9)
 
 
+def test_what_came_before_the_name_was_set_waits_for_the_transform_too(ros_environment, tmp_path, tf2):
+    from rclpy.parameter import Parameter
+
+    with live_node(ros_environment, tmp_path) as robot:
+        trial = toy_trials(1)[0]
+        robot.send(trial_messages(robot_types(), CAMERA.inverse.trial(trial), MINUTE, 'camera'))
+        robot.until_status(trials='1')
+        assert robot.calibrator.set_parameters([Parameter('frame_pose', value='table')])[0].successful
+        answer = robot.call('start')
+        assert answer.message == 'no pose of their frame came yet; start follows when they are read'
+        tf2['table', 'camera'] = CAMERA
+        robot.until_result()
+        found = robot.calibrator.session.collecting.collector.trials[0]
+        assert np.allclose(found.initial.points, trial.initial.points, atol=1e-9)
+
+
 def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'tf2_ros', None)
     with pytest.raises(InputError, match="got the name 'table', expected the numbers x y z .* not installed"):
