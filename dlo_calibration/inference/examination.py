@@ -151,7 +151,7 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
 
 
 def extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
-              fading: NDArray[np.bool_]) -> Uncertainty:
+             fading: NDArray[np.bool_]) -> Uncertainty:
     """
     Return intervals that are extended to where the residuals really change as much as the linear fit says.
 

@@ -61,15 +61,15 @@ class Outlet:
             seconds_left=progress.seconds_left, spread=progress.spread))
         progress.newest, calibration.sent = None, self._clock()
 
-    def status(self, situation: Situation, collector: TrialCollector, waits: str) -> None:
+    def status(self, situation: Situation, collector: TrialCollector, detail: str) -> None:
         """
         Send the status if it differs from the last one.
 
-        :param waits: what the node waits for, where the state has no detail.
+        :param detail: about the state.
         """
         content: dict[str, Any] = {
             'state': situation.state, 'trials': collector.count, 'last_refusal': situation.last_refusal,
-            'incomplete': collector.incomplete, 'detail': situation.detail or waits,
+            'incomplete': collector.incomplete, 'detail': detail,
             'information': situation.information, 'dropped': situation.dropped.told.total()}
         changed = {name for name, value in content.items() if value != self._status.get(name, content)}
         # What changes with each message of a stream is sent once a second.

@@ -377,8 +377,8 @@ class CalibrationSession:
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        self._outlet.status(self._situation, self._collector,
-                            self.collecting.words or self._compiling.under_way)
+        detail = self.collecting.words or self._situation.detail or self._compiling.under_way
+        self._outlet.status(self._situation, self._collector, detail)
 
     def _show(self, at_once: bool = True) -> None:
         self._outlet.markers(self._situation, self._collector, at_once)

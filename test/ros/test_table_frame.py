@@ -99,6 +99,7 @@ def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path
 
 def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_it(
         ros_environment, tmp_path, monkeypatch):
+    from graph import values
     from rclpy.parameter import Parameter
 
     from dlo_calibration.ros import calibrator_node
@@ -115,6 +116,9 @@ def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_
         monkeypatch.setattr(calibrator_node, 'ANSWER', 1e-4)
         pose = Parameter('frame_pose', value='0 0 -0.75 0 0 0 1')
         assert robot.calibrator.set_parameters([pose])[0].successful
+        robot.calibrator._work()
+        robot.calibrator.session.tick()
+        robot.until(lambda: any('anew' in values(one.status[0])['detail'] for one in robot.heard['status']))
         answer = robot.call('start')
         assert answer.success
         assert re.fullmatch('[0-9]+ messages came before; start follows when they are read', answer.message)
