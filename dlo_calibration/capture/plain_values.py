@@ -40,7 +40,8 @@ class Entry:
         if isinstance(self.value, bool) or not isinstance(self.value, (int, float)):
             raise self.refused(_shown(self.value), f'a number from {low:g} to {high:g}')
         if not low <= self.value <= high:  # also refuses nan, and compares huge integers exactly
-            raise self.refused(_shown(self.value), f'a number from {low:g} to {high:g}')
+            raise self.refused(_shown(self.value), f'{low:g}' if low == high else
+                               f'a number from {low:g} to {high:g}')
         return float(self.value)
 
     def whole(self, low: int, high: int) -> int:

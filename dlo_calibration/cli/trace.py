@@ -15,7 +15,7 @@ import numpy as np
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.chain import Chain, Floats, MOST_POINTS
 
 if TYPE_CHECKING:  # they load OpenCV, which other verbs do not need
     from dlo_calibration.capture.photograph import Photograph
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # they load OpenCV, which other verbs do not need
 
 TEXT = "find a DLO's middle line in a photograph from a few rough clicks, and with a scale its chain"
 LARGEST_DIAMETER = 0.2  # m
-COUNTS = (3, 10_000)  # of a chain's points
+COUNTS = (3, MOST_POINTS)  # of a chain's points
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.quantity import exact
 
 WHAT, ROOT = 'chain', 'point_chain'
-MOST_ROWS = 100_000
+LARGEST_CSV = 2**20  # bytes; a chain has far fewer
 LONGEST_ROW = 200  # characters
 
 
@@ -59,6 +59,9 @@ def read_chain_file(path: str | Path) -> Chain:
     octets = read_octets(path, WHAT, 'a CSV file with rows x,y,z, or an XML document with a point chain')
     if Path(path).suffix.lower() == '.xml':
         return read_chain(where, parse(octets, where, ROOT))
+    if len(octets) > LARGEST_CSV:
+        raise InputError(where, f'more than {LARGEST_CSV} bytes', 'rows x,y,z of one chain, in metres',
+                         'name the file of one chain')
     rows = []
     for number, line in enumerate(octets.splitlines(), start=1):
         text = line[:LONGEST_ROW].decode('utf-8', 'replace').strip()
@@ -70,8 +73,6 @@ def read_chain_file(path: str | Path) -> Chain:
             raise InputError(f'{where}, line {number}', repr(text), 'a row x,y,z in metres',
                              'correct the file') from error
         rows.append((x, y, z))
-        if len(rows) > MOST_ROWS:
-            raise InputError(where, f'more than {MOST_ROWS} rows', 'fewer', 'name the file of one chain')
     try:
         return Chain(np.array(rows).reshape(-1, 3))
     except InputError as error:

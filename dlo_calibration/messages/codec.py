@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import far_from_unit, MAXIMUM_HANDS, quaternion_lengths
-from dlo_calibration.model.chain import Chain, check_ends, check_size, Floats, frozen_array
+from dlo_calibration.model.chain import Chain, check_ends, check_size, Floats, frozen_array, MOST_POINTS
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
 INPUT_TYPES: Mapping[str, str] = {
@@ -25,7 +25,6 @@ INPUT_TYPES: Mapping[str, str] = {
 }
 
 NANOSECONDS = 10**9  # in a second
-MAXIMUM_POINTS = 10_000  # of a chain; a camera image sent by mistake has more
 MAXIMUM_WAYPOINTS = 100_000  # of an action; a quarter of an hour at 100 Hz
 MINIMUM_STEP = 1e-6  # s between waypoints; seconds since 1970 as float64 resolve 0.2 us
 MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start is longer
@@ -176,9 +175,9 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
         raise InputError(thing, f'height {height} and width {width}', 'height 1 or width 1',
                          'send the ordered points along the DLO, not an image')
     count = width * height
-    if count > MAXIMUM_POINTS:
-        raise InputError(thing, f'{count} points', f'at most {MAXIMUM_POINTS}',
-                         'send the points along the DLO, not the whole scene')
+    if count > MOST_POINTS:  # told before they are read, as a camera image sent by mistake has many
+        raise InputError(thing, f'{count} points', f'at most {MOST_POINTS}',
+                         'send 20 to 100 points along the DLO, not the whole scene')
     if count and step > len(cloud.data):
         raise InputError(thing, f'{len(cloud.data)} bytes of data', f'{count} points of {step} bytes',
                          'send all points, or correct point_step')

@@ -18,6 +18,8 @@ from dlo_calibration.errors import InputError
 Floats = NDArray[np.float64]
 
 MAXIMUM_COORDINATE = 1e8  # m; bytes read in the wrong order give more, and squares must not overflow
+#: Of a chain, as many as a simulated DLO has nodes at most; finding their noise takes as long as the cube.
+MOST_POINTS = 1000
 MINIMUM_SPACING = 1e-6  # m; nearer points are the same point
 NEAR = 0.02  # of a segment; a hand that grips so near to a point grips that point
 SAMPLES_PER_SEGMENT = 16  # of the arc length table; its error is below 1e-4 of a segment
@@ -114,8 +116,8 @@ class Chain:
     A point with NaN was not seen.  If at least half of the points were, and three, it is put back, see
     `put_back`, as if the points were equally spaced.
 
-    :param points: (n, 3) positions [m], n >= 3, at most MAXIMUM_COORDINATE, neighbours apart; in the chain,
-        all are finite.
+    :param points: (n, 3) positions [m], 3 <= n <= MOST_POINTS, at most MAXIMUM_COORDINATE, neighbours apart; in
+        the chain, all are finite.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
         None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.
@@ -137,6 +139,9 @@ class Chain:
             raise InputError(
                 'chain', f'{len(points)} point(s)', 'at least 3',
                 'send the points along the whole DLO, first to last')
+        if len(points) > MOST_POINTS:
+            raise InputError('chain', f'{len(points)} points', f'at most {MOST_POINTS}',
+                             'leave some of them out; 20 to 100 are enough')
         check_size('chain', 'point', points)
         bad = np.flatnonzero(np.isinf(points).any(axis=1))
         if len(bad):

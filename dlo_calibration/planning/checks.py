@@ -24,7 +24,6 @@ from dlo_calibration.planning.options import HANDS, PlanOptions
 from dlo_calibration.planning.rehearsal import Job, Rehearser, Step
 
 START, GOAL = 'start chain', 'goal chain'  # in errors
-MOST_POINTS = 1000  # as many as a simulated DLO has at most
 OTHER_LENGTH = 0.10  # share of the length; with a larger difference, the unit or the DLO is another one
 ELSEWHERE = 0.02  # share of the length; points of start and goal that are so far apart along it do not match
 DRAWS = 3  # from the posterior, at most, that are laid on the goal
@@ -43,10 +42,6 @@ def checked(found: CalibratedDlo, start: Chain, goal: Chain, simulation: Options
         action may not put the DLO over itself.
     """
     _check_dlo(found)
-    for thing, chain in ((START, start), (GOAL, goal)):
-        if len(chain) > MOST_POINTS:
-            raise InputError(thing, f'{len(chain)} points', f'at most {MOST_POINTS}',
-                             'leave some of them out')
     _check_length(START, start, found.length, 'the calibrated DLO')
     _check_length(GOAL, goal, start.length, 'the start')
     if simulation.table and not simulation.scene:

@@ -27,7 +27,6 @@ from dlo_calibration.simulation.protocol import Simulator
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
 INTERVAL = (5.0, 95.0)  # %
-MOST_POINTS = 2000  # of a chain: finding the noise in it takes as long as the cube of their number
 Doing = Union[NamedAction, Action, Step, Together]
 
 
@@ -94,9 +93,6 @@ def simulate(found: CalibratedDlo, chain: Chain,
     """
     if not actions:
         raise InputError('simulate', 'no action', 'at least one', 'say what the hands do')
-    if len(chain) > MOST_POINTS:
-        raise InputError('simulate', f'a chain of {len(chain)} points', f'at most {MOST_POINTS}',
-                         'resample it to fewer points')
     options = options or Options()
     posterior = Posterior.of(found).lying(chain, options)
     with closing(make_simulator(options)) as simulator:

@@ -4,6 +4,7 @@
 """The verb `simulate`: what it says and writes, and what it refuses."""
 
 import json
+import re
 
 from calibrated import LENGTH, straight
 import numpy as np
@@ -152,8 +153,11 @@ def test_a_chain_of_another_length_is_told(run, request_of):
 
 
 def test_more_points_than_a_dlo_has_are_refused(run, request_of):
-    code, output, notes = run(RESULT, request_of([PLACE], start=straight(5000)))
-    assert (code, output) == (2, '') and 'a chain of 5000 points, expected at most 2000' in notes
+    path = request_of([PLACE], start=straight(1000))
+    one = re.search('<point [^>]*/>', path.read_text())[0]
+    path.write_text(path.read_text().replace(one, f'{one}{one}', 1))
+    code, output, notes = run(RESULT, path)
+    assert (code, output) == (2, '') and 'got 1001 points, expected at most 1000; leave some' in notes
 
 
 def test_many_points_and_any_name(run, request_of, tmp_path, monkeypatch):

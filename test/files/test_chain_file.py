@@ -22,7 +22,8 @@ def test_a_chain_is_the_same_again(tmp_path, name):
 @pytest.mark.parametrize('name, octets, text', [
     ('a.csv', b'0,0,0\n1,0\n', 'line 2'), ('a.csv', b'', '0 point'), ('a.csv', b'\xff\xfe\0', 'line 1'),
     ('a.csv', b'0,0,0\n' * 5, 'coincident'), ('a.csv', b'nan,0,0\n1,1,1\n2,2,2\n', 'NaN'),
-    ('a.csv', b'1,1,1\n' * 100_001, 'rows'), ('a.csv', b'1' * 10**6 + b',1,1\n', 'line 1'),
+    ('a.csv', b'\n' * 2**21, 'more than 1048576 bytes'), ('a.csv', b'1,1,1\n' * 1001, '1001 points'),
+    ('a.csv', b'1' * 10**6 + b',1,1\n', 'line 1'),
     ('a.xml', b'0,0,0\n', 'XML'), ('a.xml', b'<dlo version="1"/>', 'point_chain'),
     ('a.xml', b'<point_chain version="1"><point x="1" y="1" z="1"/></point_chain>', 'point'),
 ])

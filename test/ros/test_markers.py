@@ -159,7 +159,7 @@ def test_of_many_goals_a_few_instants_are_shown_the_last_always(types):
 
 
 def test_of_many_points_two_hundred_are_shown_from_the_first_to_the_last(types):
-    trial = toy_trial(TRUTH, n=5000)
+    trial = toy_trial(TRUTH, n=500)
     initial, = shown(types, [trial])['trial_1/initial']
     assert len(initial.points) == MOST_POINTS
     assert np.array_equal(points(initial)[[0, -1]], trial.initial.points[[0, -1]])

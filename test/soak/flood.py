@@ -29,9 +29,8 @@ from dlo_calibration.messages.codec import (
     chain_cloud,
     INITIAL,
     INPUT_TYPES,
-    MAXIMUM_POINTS,
 )
-from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.chain import Chain, MOST_POINTS
 
 SHORT, FULL = 1, 130
 BURST = 3000  # messages, or as many as these bytes hold
@@ -101,8 +100,8 @@ def _messages(types):
 
     (_, chain), (_, action), (_, goal) = session_messages(types, 1)
     tiny = chain_cloud(types, Chain(np.eye(3)), MINUTE, 'world')
-    rows = np.zeros((MAXIMUM_POINTS, 3))
-    rows[:, 0] = np.linspace(0, 1, MAXIMUM_POINTS)
+    rows = np.zeros((MOST_POINTS, 3))
+    rows[:, 0] = np.linspace(0, 1, MOST_POINTS)
     largest = chain_cloud(types, Chain(rows), MINUTE, 'world')
     long = types.build(INPUT_TYPES[ACTION], header=action.header, joint_names=action.joint_names,
                        points=list(action.points) * 2000)
