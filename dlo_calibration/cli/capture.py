@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--print-board', metavar='FILE.pdf', type=Path,
                         help='write the board that is laid beside the DLO, to be printed, and end')
     parser.add_argument('--paper', choices=PAPERS, default=PAPERS[0], help='of the board; default a4')
-    add_options(parser, without=(*names_of(OBSERVATION), *_NOT_HERE))
+    add_options(parser, without=(*names_of(OBSERVATION), *_NOT_HERE), title='options of the calibrator')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:

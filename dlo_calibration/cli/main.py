@@ -26,6 +26,7 @@ from dlo_calibration.cli import (
     validate,
     warm_up,
 )
+from dlo_calibration.cli.options import dashed, PREFIX
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
@@ -61,7 +62,7 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
         if words and words[0] not in VERBS and not words[0].startswith('-'):
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
                              meant(words[0], VERBS, f'see {PROGRAM} --help'))
-        chosen = _parser().parse_args(words)
+        chosen = _parser().parse_args(dashed(words))
         code: int = chosen.act(chosen, make_simulator)
         return code
     except DloCalibrationError as error:
@@ -73,6 +74,14 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
     except BrokenPipeError:  # the reader of the pipe, such as `head`, has ended
         sys.stderr.close()
         return 0
+
+
+class _Help(argparse.HelpFormatter):
+    """Help whose first lines show what is a verb's own; the options of a calibration are listed below."""
+
+    def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: Any = None) -> None:
+        """Leave the options out."""
+        super().add_usage(usage, [one for one in actions if not one.dest.startswith(PREFIX)], groups, prefix)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -96,7 +105,8 @@ def _parser() -> argparse.ArgumentParser:
         'Find the physical parameters of a rope, cable, wire or hose from recorded manipulations.'))
     verbs = parser.add_subparsers(required=True, metavar='VERB')
     for name, verb in VERBS.items():
-        added = verbs.add_parser(name, help=verb.TEXT, description=verb.TEXT, allow_abbrev=False)
+        added = verbs.add_parser(name, help=verb.TEXT, description=verb.TEXT, allow_abbrev=False,
+                                formatter_class=_Help)
         added.set_defaults(act=verb.act)
         verb.add_arguments(added)
     return parser

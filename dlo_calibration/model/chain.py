@@ -116,8 +116,8 @@ class Chain:
     A point with NaN was not seen.  If at least half of the points were, and three, it is put back, see
     `put_back`, as if the points were equally spaced.
 
-    :param points: (n, 3) positions [m], 3 <= n <= MOST_POINTS, at most MAXIMUM_COORDINATE, neighbours apart; in
-        the chain, all are finite.
+    :param points: (n, 3) positions [m], 3 <= n <= MOST_POINTS, at most MAXIMUM_COORDINATE, neighbours apart;
+        in the chain, all are finite.
     :param hands: (n,) number of the hand that holds each point, 0 for none; or
         None where the source does not annotate it.
     :param features: (n,) True where an annotator marked a geometric feature.

@@ -21,7 +21,7 @@ OBJECT = str(SAMPLES / 'object1')
 
 @pytest.mark.parametrize('words, meant', [
     ('ft', 'fit'), ('valdate', 'validate'), ('fit x --evalations 5', '--evaluations'),
-    ('fit x --bending_frction 5', '--bending_friction'),
+    ('fit x --bending_frction 5', '--bending-friction'),
     (f'fit {OBJECT} --search least-square', 'least_squares'), (f'fit {OBJECT} --engine Bulet', 'bullet'),
     (f'fit {OBJECT} --calibrate flexibilty friction', 'flexibility'),
     ('experiment --search lest_squares', 'least_squares')])

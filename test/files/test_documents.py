@@ -3,6 +3,7 @@
 
 """The documents say what is declared."""
 
+import argparse
 from pathlib import Path
 import re
 
@@ -10,6 +11,8 @@ from made_up_plan import made_up_plan
 import pytest
 
 from dlo_calibration.calibration.options import declarations
+from dlo_calibration.cli import main
+from dlo_calibration.cli.options import PREFIX
 from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
@@ -18,6 +21,12 @@ from dlo_calibration.ros import planner_diagnostics, planner_session
 from dlo_calibration.ros.planner_options import PlannerOptions
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def headings(path):
+    """Return the headings of a document, as links name them."""
+    found = re.findall('^#+ (.*)$', path.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'[^\w -]', '', one).lower().replace(' ', '-') for one in found}
 
 
 def sections():
@@ -52,8 +61,22 @@ def test_every_topic_is_documented():
     for name in (*planner_session.INPUT_TYPES, *planner_session.OUTPUT_TYPES, 'plan', 'stop'):
         assert f'~/{name}' in planner
     calibrator = ''.join(text for heading, text in sections().items() if heading != 'The planner')
-    for name in ('initial_chain', 'action', 'goal_chain', *OUTPUT_TYPES, 'start', 'stop', 'reset'):
+    for name in ('initial_chain', 'action', 'goal_chain', *OUTPUT_TYPES,
+                 'start', 'stop', 'reset', 'discard_last'):
         assert f'~/{name}' in calibrator
+
+
+def test_every_verb_is_documented_with_its_own_flags():
+    text = (ROOT / 'doc/commands.md').read_text(encoding='utf-8')
+    first, common, *verbs = text.split('\n## ')
+    told = {text.partition('\n')[0]: text for text in verbs}
+    assert set(told) == set(main.VERBS) == set(re.findall('^\\| \\[`(.*?)`\\]', first, re.MULTILINE))
+    for verb, module in main.VERBS.items():
+        parser = argparse.ArgumentParser(add_help=False)
+        module.add_arguments(parser)
+        for flag in (action for action in parser._actions if not action.dest.startswith(PREFIX)):
+            for word in flag.option_strings or [flag.metavar]:
+                assert word in f'{told[verb]}{common}', f'{verb} {word}'
 
 
 def test_every_key_of_the_planners_status_is_documented():
@@ -72,11 +95,13 @@ def test_every_key_of_a_plan_is_documented():
 
 
 @pytest.mark.parametrize('document', [
-    'README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'doc/capture.md', 'doc/guide.md',
-    'doc/messages.md', 'doc/formats.md', 'doc/physics.md', 'doc/planning.md', 'doc/report.md',
+    'README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'doc/capture.md', 'doc/commands.md',
+    'doc/guide.md', 'doc/messages.md', 'doc/formats.md', 'doc/physics.md', 'doc/planning.md', 'doc/report.md',
     'doc/experiment.md', 'msg_samples/README.md', 'msg_samples/photographs/README.md', 'benchmark/README.md'])
 def test_links_lead_somewhere(document):
     text = (ROOT / document).read_text(encoding='utf-8')
-    for target in re.findall(r'\]\(([^)#]+)\)', text):
+    for target, heading in re.findall(r'\]\(([^)#]*)#?([^)]*)\)', text):
         if '://' not in target:
-            assert ((ROOT / document).parent / target).exists(), target
+            path = (ROOT / document).parent / target if target else ROOT / document
+            assert path.exists(), target
+            assert not heading or heading in headings(path), f'{target}#{heading}'
