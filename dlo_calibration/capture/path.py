@@ -114,6 +114,137 @@ def _pop(heap: NDArray[np.int64], keys: NDArray[np.float32], count: int) -> None
     heap[at], keys[at] = state, key
 
 
+@_compiled()
+def _with(states: NDArray[np.int64], count: int, state: int) -> NDArray[np.int64]:
+    """Return an array of `count` states, or one with more room, to which a state is added."""
+    if count == len(states):
+        states = np.concatenate((states, states))
+    states[count] = state
+    return states
+
+
+@_compiled()
+def _beside(place: Floats, reach: float, height: int, width: int
+            ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the states around a click, in all directions, and what each costs."""
+    span = int(reach) + 1
+    size = (2 * span + 1) ** 2 * 16
+    states, costs = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.float32)
+    count = 0
+    u, v = int(round(place[0])), int(round(place[1]))
+    for y in range(max(0, v - span), min(height, v + span + 1)):
+        for x in range(max(0, u - span), min(width, u + span + 1)):
+            aside = math.hypot(x - place[0], y - place[1])
+            if aside <= reach:
+                for d in range(16):
+                    states[count], costs[count] = (y * width + x) * 16 + d, aside * ASIDE
+                    count += 1
+    return states[:count], costs[:count]
+
+
+@_compiled()
+def _part(hessian: NDArray[np.float32], floor: float, moves: NDArray[np.int64], goal: Floats, reach: float,
+          most: int, begins: NDArray[np.int64], begin_costs: NDArray[np.float32], cost: NDArray[np.float32],
+          before: NDArray[np.int8]
+          ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], int]:
+    """
+    Find the ways from one click to the next.
+
+    :param begins: (s,) states at the first click, and their costs.
+    :param cost: (height * width * 16,) of the best way to each state, all inf; those found are filled in.
+    :param before: likewise, the direction in which the way came to the state before; -1 at a begin.
+    :returns: (a,) states near `goal` and their costs; the states whose `cost` was filled in; and how many
+        were looked at, which are at most `most`.
+    """
+    height, width = hessian.shape[0], hessian.shape[1]
+    lengths = np.sqrt((moves * moves).sum(axis=1).astype(np.float64))
+    across = np.empty((16, 3))  # weights of the three second derivatives, across each direction
+    for d in range(16):
+        x, y = -moves[d, 1] / lengths[d], moves[d, 0] / lengths[d]
+        across[d, 0], across[d, 1], across[d, 2] = x * x, 2 * x * y, y * y
+    heap, keys = np.empty(1 << 16, dtype=np.int64), np.empty(1 << 16, dtype=np.float32)
+    touched = np.empty(1 << 16, dtype=np.int64)
+    held, reached, looked = 0, 0, 0
+    for k in range(len(begins)):
+        if begin_costs[k] < cost[begins[k]]:
+            touched = _with(touched, reached, begins[k])
+            reached += 1
+            cost[begins[k]], before[begins[k]] = begin_costs[k], -1
+            if held == len(heap):
+                heap, keys = np.concatenate((heap, heap)), np.concatenate((keys, keys))
+            _push(heap, keys, held, begins[k], begin_costs[k])
+            held += 1
+    size = (2 * (int(reach) + 1) + 1) ** 2 * 16
+    arrivals, arrival_costs = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.float32)
+    arrived, nearest = 0, np.inf
+    while held and looked < most:
+        looked += 1
+        state, key = heap[0], keys[0]
+        _pop(heap, keys, held)
+        held -= 1
+        if key > cost[state]:
+            continue
+        if key > nearest + CROSSED:
+            break
+        pixel, direction = state // 16, state % 16
+        x, y = pixel % width, pixel // width
+        aside = math.hypot(x - goal[0], y - goal[1])
+        if aside <= reach and arrived < size:
+            arrivals[arrived], arrival_costs[arrived] = state, key + aside * ASIDE
+            arrived += 1
+            nearest = min(nearest, key + aside * ASIDE)
+        for turn in range(-2, 3):
+            d = (direction + turn) % 16
+            i, j = x + moves[d, 0], y + moves[d, 1]
+            if not (0 <= i < width and 0 <= j < height):
+                continue
+            strength = 0.0
+            half_y, half_x = (y + j) // 2, (x + i) // 2
+            for k in range(3):
+                strength += 0.5 * across[d, k] * (hessian[j, i, k] + hessian[half_y, half_x, k])
+            off = 1 - min(1.0, max(0.0, (strength - floor * 0.5) / (STRONG - floor * 0.5)))
+            new = key + lengths[d] * (1 + (OFF - 1) * off * off) + BEND * turn * turn
+            after = (j * width + i) * 16 + d
+            if new < cost[after]:
+                if cost[after] == np.inf:
+                    touched = _with(touched, reached, after)
+                    reached += 1
+                cost[after], before[after] = new, direction
+                if held == len(heap):
+                    heap, keys = np.concatenate((heap, heap)), np.concatenate((keys, keys))
+                _push(heap, keys, held, after, new)
+                held += 1
+    kept = np.flatnonzero(arrival_costs[:arrived] <= nearest + CROSSED)
+    return arrivals[kept], arrival_costs[kept], touched[:reached], looked
+
+
+@_compiled()
+def _back(ends: NDArray[np.int64], begins: NDArray[np.int64], before: NDArray[np.int8], width: int,
+          moves: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """
+    Return the pixels of the ways back from `ends`, one after the other.
+
+    :returns: the pixels; (e + 1,) where each way begins among them; (e,) index of its begin in `begins`.
+    """
+    pixels, bounds = np.empty(1 << 12, dtype=np.int64), np.empty(len(ends) + 1, dtype=np.int64)
+    links = np.full(len(ends), -1, dtype=np.int64)
+    length = 0
+    for k in range(len(ends)):
+        state, bounds[k] = ends[k], length
+        while before[state] >= 0:
+            pixels = _with(pixels, length, state // 16)
+            length += 1
+            d = state % 16
+            pixel = state // 16 - moves[d, 1] * width - moves[d, 0]
+            state = pixel * 16 + before[state]
+        for begin in range(len(begins)):
+            if begins[begin] == state:
+                links[k] = begin
+                break
+    bounds[-1] = length
+    return pixels[:length].copy(), bounds, links
+
+
 @_compiled('int64[::1](float32[:, :, ::1], float64, float64[:, ::1], float64, int64[:, ::1], int64)')
 def _way(hessian: NDArray[np.float32], floor: float, places: Floats, reach: float,
          moves: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -123,133 +254,28 @@ def _way(hessian: NDArray[np.float32], floor: float, places: Floats, reach: floa
     It is empty if there is none within `most` states.
     """
     height, width = hessian.shape[0], hessian.shape[1]
-    count = height * width * 16
-    cost = np.full(count, np.inf, dtype=np.float32)
-    before = np.zeros(count, dtype=np.int8)
-    touched = np.empty(1 << 16, dtype=np.int64)
-    heap, keys = np.empty(1 << 16, dtype=np.int64), np.empty(1 << 16, dtype=np.float32)
-    lengths = np.sqrt((moves * moves).sum(axis=1).astype(np.float64))
-    across = np.empty((16, 3))
-    for d in range(16):
-        x, y = -moves[d, 1] / lengths[d], moves[d, 0] / lengths[d]
-        across[d, 0], across[d, 1], across[d, 2] = x * x, 2 * x * y, y * y
-    span = int(reach) + 1
-
-    size = (2 * span + 1) ** 2 * 16
-    seeds, seed_costs = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.float32)
-    seeded = 0
-    u, v = int(round(places[0, 0])), int(round(places[0, 1]))
-    for y in range(max(0, v - span), min(height, v + span + 1)):
-        for x in range(max(0, u - span), min(width, u + span + 1)):
-            aside = math.hypot(x - places[0, 0], y - places[0, 1])
-            if aside <= reach:
-                for d in range(16):
-                    seeds[seeded], seed_costs[seeded] = (y * width + x) * 16 + d, aside * ASIDE
-                    seeded += 1
-    # The ways of all parts are kept as chains of states, of which the last click chooses one.
+    cost = np.full(height * width * 16, np.inf, dtype=np.float32)
+    before = np.zeros(height * width * 16, dtype=np.int8)
+    begins, costs = _beside(places[0], reach, height, width)
     parts = len(places) - 1
-    links = np.empty((parts, size), dtype=np.int64)  # where the way to an arrival begins: index of a seed
-    chains = [np.empty(0, dtype=np.int64)]
-    bounds = np.zeros((parts, size + 1), dtype=np.int64)
-    best = 0
+    # The ways of all parts are kept, and the last click chooses one; [:0] tells the compiler the types.
+    nothing = np.empty(0, dtype=np.int64)
+    chains, bounds, links = [nothing][:0], [nothing][:0], [nothing][:0]
     looked = 0
     for part in range(parts):
-        held, reached = 0, 0
-        for k in range(seeded):
-            if seed_costs[k] < cost[seeds[k]]:
-                if reached == len(touched):
-                    touched = np.concatenate((touched, touched))
-                touched[reached] = seeds[k]
-                reached += 1
-                cost[seeds[k]] = seed_costs[k]
-                before[seeds[k]] = -1
-                if held == len(heap):
-                    heap, keys = np.concatenate((heap, heap)), np.concatenate((keys, keys))
-                _push(heap, keys, held, seeds[k], seed_costs[k])
-                held += 1
-        goal = places[part + 1]
-        arrivals, arrival_costs = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.float32)
-        arrived = 0
-        nearest = np.inf
-        while held and looked < most:
-            looked += 1
-            state, key = heap[0], keys[0]
-            _pop(heap, keys, held)
-            held -= 1
-            if key > cost[state]:
-                continue
-            if key > nearest + CROSSED:
-                break
-            pixel, direction = state // 16, state % 16
-            x, y = pixel % width, pixel // width
-            aside = math.hypot(x - goal[0], y - goal[1])
-            if aside <= reach and arrived < size:
-                arrivals[arrived], arrival_costs[arrived] = state, key + aside * ASIDE
-                arrived += 1
-                nearest = min(nearest, key + aside * ASIDE)
-            for turn in range(-2, 3):
-                d = (direction + turn) % 16
-                i, j = x + moves[d, 0], y + moves[d, 1]
-                if not (0 <= i < width and 0 <= j < height):
-                    continue
-                strength = 0.0
-                half_y, half_x = (y + j) // 2, (x + i) // 2
-                for k in range(3):
-                    strength += 0.5 * across[d, k] * (hessian[j, i, k] + hessian[half_y, half_x, k])
-                share = min(1.0, max(0.0, (strength - floor * 0.5) / (STRONG - floor * 0.5)))
-                off = 1 - share
-                new = key + lengths[d] * (1 + (OFF - 1) * off * off) + BEND * turn * turn
-                after = (j * width + i) * 16 + d
-                if new < cost[after]:
-                    if cost[after] == np.inf:
-                        if reached == len(touched):
-                            touched = np.concatenate((touched, touched))
-                        touched[reached] = after
-                        reached += 1
-                    cost[after] = new
-                    before[after] = direction
-                    if held == len(heap):
-                        heap, keys = np.concatenate((heap, heap)), np.concatenate((keys, keys))
-                    _push(heap, keys, held, after, new)
-                    held += 1
-        # Walk back from every arrival that can still be the best, and remember the pixels.
-        pixels = np.empty(1 << 12, dtype=np.int64)
-        length, kept = 0, 0
-        next_seeds, next_costs = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.float32)
-        for k in range(arrived):
-            if arrival_costs[k] > nearest + CROSSED:
-                continue
-            state = arrivals[k]
-            bounds[part, kept] = length
-            while before[state] >= 0:
-                if length == len(pixels):
-                    pixels = np.concatenate((pixels, pixels))
-                pixels[length] = state // 16
-                length += 1
-                d = state % 16
-                pixel = state // 16 - moves[d, 1] * width - moves[d, 0]
-                state = pixel * 16 + before[state]
-            links[part, kept] = -1
-            for s in range(seeded):
-                if seeds[s] == state:
-                    links[part, kept] = s
-                    break
-            next_seeds[kept], next_costs[kept] = arrivals[k], arrival_costs[k]
-            kept += 1
-        bounds[part, kept] = length
-        chains.append(pixels[:length].copy())
-        for k in range(reached):
-            cost[touched[k]] = np.inf
-        seeds, seed_costs, seeded = next_seeds, next_costs, kept
-        best = 0
-        for k in range(kept):
-            if next_costs[k] < next_costs[best]:
-                best = k
-    found = np.empty(0, dtype=np.int64)
-    for back in range(parts):
-        part = parts - 1 - back
-        found = np.concatenate((found, chains[part + 1][bounds[part, best]:bounds[part, best + 1]]))
-        best = links[part, best]
-        if best < 0:
-            break
+        ends, costs, touched, seen = _part(hessian, floor, moves, places[part + 1], reach, most - looked,
+                                           begins, costs, cost, before)
+        looked += seen
+        if not len(ends):
+            return nothing
+        chain, bound, link = _back(ends, begins, before, width, moves)
+        chains.append(chain)
+        bounds.append(bound)
+        links.append(link)
+        cost[touched] = np.inf
+        begins = ends
+    found, best = nothing, np.argmin(costs)
+    for part in range(parts - 1, -1, -1):
+        found = np.concatenate((found, chains[part][bounds[part][best]:bounds[part][best + 1]]))
+        best = links[part][best]
     return found[::-1].copy()

@@ -11,6 +11,7 @@ from photographs import Camera, Hand, Look, photograph
 import pytest
 from rendered_scenes import distances, scene
 
+from dlo_calibration.capture import path
 from dlo_calibration.capture.trace import Tracer
 from dlo_calibration.errors import InputError
 
@@ -138,6 +139,13 @@ def test_where_there_is_no_dlo_it_says_so(ground):
         pixels = photograph(Camera(size=(1200, 900), focal_length=900.0), None, 0.0, Look(ground=ground), 1)
     with pytest.raises(InputError, match='DLO'):
         Tracer(pixels).trace([(200, 200), (600, 500), (1000, 400)])
+
+
+def test_a_search_that_would_take_too_long_ends_without_a_dlo(monkeypatch):
+    pixels = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
+    monkeypatch.setattr(path, 'MOST', 50)
+    with pytest.raises(InputError, match='DLO'):
+        Tracer(pixels).trace([(20, 20), (150, 100), (280, 180)])
 
 
 @pytest.mark.parametrize('shape', [(40, 60), (1, 1), (3, 2000)])
