@@ -12,7 +12,7 @@ from typing import Awaitable, Callable
 
 from aiohttp import web
 
-from dlo_calibration.capture.session import NotThere
+from dlo_calibration.capture.studio import NotThere
 from dlo_calibration.errors import DEFECT, DloCalibrationError, told
 
 LOG = logging.getLogger('dlo_calibration')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The server of the page: HTTP on one side, a `CaptureSession` on the other."""
+"""The server of the page: HTTP on one side, a `Studio` on the other."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dlo_calibration.capture.connections import Connections
 from dlo_calibration.capture.events import Events
 from dlo_calibration.capture.guard import Guard, LOG, Refused, REPORT_POLICY
 from dlo_calibration.capture.project import OldRevision, Project
-from dlo_calibration.capture.session import CaptureSession
+from dlo_calibration.capture.studio import Studio
 from dlo_calibration.errors import InputError
 
 PAGE = Path(__file__).parent / 'page'
@@ -48,18 +48,18 @@ def serve(project: Project, connections: Connections, *, host: str = '127.0.0.1'
     :param ready: called with the address of the page, when it can be opened.
     :raises InputError: if the server cannot listen there.
     """
-    session = CaptureSession(project, connections)
+    studio = Studio(project, connections)
     try:
-        asyncio.run(_serve(session, host, port, ready, should_stop))
+        asyncio.run(_serve(studio, host, port, ready, should_stop))
     finally:
-        session.close()
+        studio.close()
 
 
-async def _serve(session: CaptureSession, host: str, port: int, ready: Callable[[str], None],
+async def _serve(studio: Studio, host: str, port: int, ready: Callable[[str], None],
                  should_stop: Callable[[], bool]) -> None:
     token = secrets.token_urlsafe(24)
     guard, events = Guard(host, token), Events()
-    runner = web.AppRunner(application(session, events, guard, token), access_log=None, shutdown_timeout=1.0)
+    runner = web.AppRunner(application(studio, events, guard, token), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:
         site = web.TCPSite(runner, host, port)
@@ -72,7 +72,7 @@ async def _serve(session: CaptureSession, host: str, port: int, ready: Callable[
         ready(f'http://{_named(host)}:{guard.port}/{token}/')
         while not should_stop():
             await asyncio.sleep(TICK)
-            await _tell(session, events)
+            await _tell(studio, events)
     finally:
         events.close()
         await runner.cleanup()
@@ -88,19 +88,19 @@ def _named(host: str) -> str:
     return f'[{host}]' if ':' in host else host
 
 
-async def _tell(session: CaptureSession, events: Events) -> None:
+async def _tell(studio: Studio, events: Events) -> None:
     """Tell the open pages what happened in the background."""
     try:
-        for name in await asyncio.to_thread(session.tick):
-            events.tell(name, await asyncio.to_thread(getattr(session, name)))
+        for name in await asyncio.to_thread(studio.tick):
+            events.tell(name, await asyncio.to_thread(getattr(studio, name)))
     except Exception:  # a defect must not end the page, and should not fill the terminal
         LOG.exception('what happened in the background')
         await asyncio.sleep(PAUSE)
 
 
-def application(session: CaptureSession, events: Events, guard: Guard, token: str) -> web.Application:
+def application(studio: Studio, events: Events, guard: Guard, token: str) -> web.Application:
     """Return the server's application."""
-    routes = Routes(session, events)
+    routes = Routes(studio, events)
     app = web.Application(middlewares=[guard.answer], client_max_size=LARGEST_PHOTOGRAPH)
     base = f'/{token}'
     for method, path, handler in (
@@ -121,8 +121,8 @@ def application(session: CaptureSession, events: Events, guard: Guard, token: st
 class Routes:
     """Answers requests; whatever takes time is done in a thread."""
 
-    def __init__(self, session: CaptureSession, events: Events) -> None:
-        self._session, self._events = session, events
+    def __init__(self, studio: Studio, events: Events) -> None:
+        self._studio, self._events = studio, events
         self._pages = {file.name: file for file in PAGE.glob('*') if file.suffix in TYPES}
 
     async def page(self, request: web.Request) -> web.StreamResponse:
@@ -135,29 +135,29 @@ class Routes:
 
     async def state(self, request: web.Request) -> web.StreamResponse:
         """Give all that the page draws."""
-        return await self._answer(self._session.state)
+        return await self._answer(self._studio.state)
 
     async def change(self, request: web.Request) -> web.StreamResponse:
         """Take a changed document."""
         given = await _object(request)
         try:
             return await self._changed(partial(
-                self._session.change, given.get('document'), given.get('revision')))
+                self._studio.change, given.get('document'), given.get('revision')))
         except OldRevision as error:
-            state = await asyncio.to_thread(self._session.state)
+            state = await asyncio.to_thread(self._studio.state)
             return _json({'error': str(error), 'state': state}, status=409)
 
     async def add_photograph(self, request: web.Request) -> web.StreamResponse:
         """Take a photograph."""
         octets = await _octets(request, LARGEST_PHOTOGRAPH)
-        return await self._changed(partial(self._session.add_photograph, octets, _name(request)))
+        return await self._changed(partial(self._studio.add_photograph, octets, _name(request)))
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Give a photograph as a JPEG of any width."""
         width = request.query.get('width')
         if width is not None and not re.fullmatch('[0-9]{1,5}', width):
             raise Refused(400, 'the width of a picture is a number of pixels')
-        octets = await asyncio.to_thread(self._session.picture, request.match_info['id'],
+        octets = await asyncio.to_thread(self._studio.picture, request.match_info['id'],
                                          int(width) if width else None)
         return web.Response(body=octets, content_type='image/jpeg',
                             headers={'Cache-Control': 'private, max-age=31536000, immutable'})
@@ -165,11 +165,11 @@ class Routes:
     async def set_lens(self, request: web.Request) -> web.StreamResponse:
         """Take a camera calibration."""
         octets = await _octets(request, LARGEST_TEXT)
-        return await self._changed(partial(self._session.set_lens, octets, _name(request)))
+        return await self._changed(partial(self._studio.set_lens, octets, _name(request)))
 
     async def remove_lens(self, request: web.Request) -> web.StreamResponse:
         """Forget the camera calibration."""
-        return await self._changed(self._session.remove_lens)
+        return await self._changed(self._studio.remove_lens)
 
     async def board(self, request: web.Request) -> web.StreamResponse:
         """Give the board to be printed."""
@@ -181,11 +181,11 @@ class Routes:
 
     async def calibrate(self, request: web.Request) -> web.StreamResponse:
         """Begin to calibrate."""
-        return await self._changed(partial(self._session.calibrate, await _object(request)))
+        return await self._changed(partial(self._studio.calibrate, await _object(request)))
 
     async def stop(self, request: web.Request) -> web.StreamResponse:
         """End the calibration with the best so far."""
-        return await self._changed(self._session.stop)
+        return await self._changed(self._studio.stop)
 
     async def film(self, request: web.Request) -> web.StreamResponse:
         """Give the simulated motion of a trial."""
@@ -193,12 +193,12 @@ class Routes:
         if not re.fullmatch('[0-9]{1,3}', number):
             raise web.HTTPNotFound
         identity = request.query.get('photograph', '')
-        return await self._answer(partial(self._session.film, int(number), identity))
+        return await self._answer(partial(self._studio.film, int(number), identity))
 
     async def file(self, request: web.Request) -> web.StreamResponse:
         """Give a file to save, or the report to be read."""
         name = request.match_info['name']
-        octets = await asyncio.to_thread(self._session.file, name)
+        octets = await asyncio.to_thread(self._studio.file, name)
         kind = TYPES[Path(name).suffix]
         if name.endswith('.html'):
             return web.Response(body=octets, content_type=kind, charset='utf-8',
@@ -207,17 +207,17 @@ class Routes:
 
     async def topics(self, request: web.Request) -> web.StreamResponse:
         """Give the ROS topics with images."""
-        return _json({'topics': await asyncio.to_thread(self._session.topics)})
+        return _json({'topics': await asyncio.to_thread(self._studio.topics)})
 
     async def add_topic_image(self, request: web.Request) -> web.StreamResponse:
         """Take the newest image of a topic."""
         topic = _word(await _object(request), 'name')
-        return await self._changed(partial(self._session.add_topic_image, topic))
+        return await self._changed(partial(self._studio.add_topic_image, topic))
 
     async def send(self, request: web.Request) -> web.StreamResponse:
         """Send the trials to a running calibrator."""
         namespace = _word(await _object(request), 'namespace')
-        return _json({'text': await asyncio.to_thread(self._session.send, namespace)})
+        return _json({'text': await asyncio.to_thread(self._studio.send, namespace)})
 
     async def _answer(self, what: Callable[[], Any]) -> web.StreamResponse:
         return _json(await asyncio.to_thread(what))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""CaptureSession: everything that the page asks for; it makes all decisions, and knows nothing of HTTP."""
+"""Studio: everything that the page asks for; it makes all decisions, and knows nothing of HTTP."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class _Read:
     digest: str
 
 
-class CaptureSession:
+class Studio:
     """
     What a person does to a project, and what comes of it; usable from any thread.
 
