@@ -62,7 +62,7 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
         if words and words[0] not in VERBS and not words[0].startswith('-'):
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
                              meant(words[0], VERBS, f'see {PROGRAM} --help'))
-        chosen = _parser().parse_args(dashed(words))
+        chosen = _parser(words).parse_args(dashed(words))
         code: int = chosen.act(chosen, make_simulator)
         return code
     except DloCalibrationError as error:
@@ -100,7 +100,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'{self.prog}: {printable(" ".join(message.split()))}; see {self.prog} --help\n')
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser; only a verb that is among the words has its arguments, as there are hundreds."""
     parser = _Parser(prog=PROGRAM, allow_abbrev=False, description=(
         'Find the physical parameters of a rope, cable, wire or hose from recorded manipulations.'))
     verbs = parser.add_subparsers(required=True, metavar='VERB')
@@ -108,5 +109,6 @@ def _parser() -> argparse.ArgumentParser:
         added = verbs.add_parser(name, help=verb.TEXT, description=verb.TEXT, allow_abbrev=False,
                                 formatter_class=_Help)
         added.set_defaults(act=verb.act)
-        verb.add_arguments(added)
+        if name in words:
+            verb.add_arguments(added)
     return parser
