@@ -123,12 +123,6 @@ def axis_of(trace: Trace, scale: Scale, diameter: float, count: int,
     return Axis(points, trace.sure, np.interp(over.ravel(), along, lifted), diameter)
 
 
-def chain_of(trace: Trace, scale: Scale, diameter: float, count: int,
-             above: Mapping[int, bool] | None = None) -> Chain:
-    """Return the chain of `count` evenly spaced points of a DLO on the table; see `axis_of`."""
-    return axis_of(trace, scale, diameter, count, above).chain(np.linspace(0.0, 1.0, count))
-
-
 def measured_diameter(trace: Trace, scale: Scale) -> float:
     """Return the diameter of a round DLO on the table from its width in the photograph [m]."""
     points = scale.to_table(trace.pixels)

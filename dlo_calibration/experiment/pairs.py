@@ -49,9 +49,9 @@ def share_apart(dlo: KnownDlo, points: Floats, others: Floats) -> float:
     return float(np.linalg.norm(seen(points) - seen(others), axis=-1).mean()) / dlo.length
 
 
-def random_pairs(dlo: KnownDlo, count: int, seed: int, simulator: Simulator) -> tuple[Pair, ...]:
+def random_pair(dlo: KnownDlo, index: int, seed: int, simulator: Simulator) -> Pair:
     """
-    Return random pairs of a DLO; pair k depends on the seed and k alone.
+    Return a random pair of a DLO; it depends on the seed and its index alone.
 
     Start and goal are random smooth curves without crossings, whose curvature is a sum of MODES cosines.
     The DLO is laid there and let go, and stays as the simulation leaves it at rest.  The goal is then
@@ -59,11 +59,6 @@ def random_pairs(dlo: KnownDlo, count: int, seed: int, simulator: Simulator) -> 
 
     :param simulator: simulates with the true properties.
     """
-    return tuple(random_pair(dlo, k, seed, simulator) for k in range(count))
-
-
-def random_pair(dlo: KnownDlo, index: int, seed: int, simulator: Simulator) -> Pair:
-    """Return one pair of `random_pairs`."""
     generator = np.random.default_rng([seed, index])
     start = _shape(dlo, generator, simulator)
     apart = generator.uniform(*DISTANCE)

@@ -57,7 +57,7 @@ class PlanTask:
     """
     Plans from one start to one goal with one set of parameters.
 
-    :param index: of the pair in `random_pairs`, which have the seed `seed`.
+    :param index: of the `random_pair`, which has the seed `seed`.
     :param options: of the planner.
     :param engine: name of its simulator.
     """

@@ -246,4 +246,4 @@ def _grips(hand: Mapping[str, Any]) -> str:
     points, offset = hand['grips'], hand['offset']
     if offset:
         return f'between points {points[0] - (offset < 0)} and {points[0] + (offset > 0)}'
-    return f"points {' '.join(map(str, points))}"
+    return f"point{'s' * (len(points) > 1)} {' '.join(map(str, points))}"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from views import curve, DIAMETER, loop, traced, view
 
-from dlo_calibration.capture.chains import axis_of, chain_of, measured_diameter
+from dlo_calibration.capture.chains import axis_of, measured_diameter
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
@@ -18,12 +18,13 @@ from dlo_calibration.simulation.compiled import CompiledSimulator
 
 VIEWS = {'from above': view(), 'oblique': view(math.radians(40), 0.7), 'near': view(0.3, -2.0, 0.5)}
 COUNT = 21
+EVENLY = np.linspace(0, 1, COUNT)
 
 
 @pytest.mark.parametrize('scale', VIEWS.values(), ids=VIEWS)
 def test_the_points_are_evenly_spaced_on_the_axis_of_the_dlo(scale):
     points = curve()
-    chain = chain_of(traced(points, scale), scale, DIAMETER, COUNT)
+    chain = axis_of(traced(points, scale), scale, DIAMETER, COUNT).chain(EVENLY)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     even = np.linspace(0.0, along[-1], COUNT)
     expected = np.stack([np.interp(even, along, axis) for axis in points.T], axis=1)
@@ -78,7 +79,7 @@ def test_the_simulation_begins_and_ends_with_the_same_strand_above(first_above, 
     points, pair = loop(height=diameter / 2)
     scale = view(0.4)
     trace = traced(points, scale, [pair], diameter)
-    chain = chain_of(trace, scale, diameter, COUNT, {0: first_above})
+    chain = axis_of(trace, scale, diameter, COUNT, {0: first_above}).chain(EVENLY)
     hand = Hand('left_hand', (0,), [0.0, 0.4], [chain.points[0], chain.points[0] - (0.03, 0.02, 0)])
     trial = Trial('loop', chain, (Action((hand,)),), (
         Goal(chain, 0.1, stable=False), Goal(chain, 2.0)))
