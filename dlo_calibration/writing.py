@@ -91,6 +91,9 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with _temporary(folder) as new:
             new.write_bytes(b'?')  # a full disk may still make a file without content
+    except FileExistsError as error:
+        raise InputError(f'folder {folder}', 'a file of this name', 'a folder, or a name that is free',
+                         'choose another one with --output') from error
     except OSError as error:
         raise unwritable(folder, error, 'folder') from error
 

@@ -59,7 +59,9 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
     """
     try:
         words = sys.argv[1:] if args is None else args
-        if words and words[0] not in VERBS and not words[0].startswith('-'):
+        if not words:
+            raise InputError('verb', 'none', f'one of {", ".join(VERBS)}', f'see {PROGRAM} --help')
+        if words[0] not in VERBS and not words[0].startswith('-'):
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
                              meant(words[0], VERBS, f'see {PROGRAM} --help'))
         chosen = _parser(words).parse_args(dashed(words))

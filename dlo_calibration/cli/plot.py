@@ -11,10 +11,9 @@ from pathlib import Path
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, tell
-from dlo_calibration.cli.source import add_source, read_source
+from dlo_calibration.cli.source import add_source, read_result_file, read_source
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.result import read_result
 
 TEXT = 'draw a picture of each trial, as measured and as simulated with a result'
 
@@ -38,7 +37,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if chosen.animation and chosen.result is None:
         raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
                          'name a result: dlo-calibration plot SESSION RESULT.xml --animation')
-    file = None if chosen.result is None else read_result(chosen.result)
+    file = None if chosen.result is None else read_result_file(chosen)
     source = read_source(chosen, tell, None if file is None else file.file_options).require_trials()
     result = None if file is None else validated(file, source.trials, source.options, make_simulator)
     pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell,

@@ -17,9 +17,14 @@ from dlo_calibration.cli.options import add_options
 from dlo_calibration.cli.output import print_json, standard_output, tell
 from dlo_calibration.cli.plan import SIMULATION
 from dlo_calibration.cli.prediction_files import write_prediction_files
-from dlo_calibration.cli.source import add_common_arguments, add_without, read_manipulations
+from dlo_calibration.cli.source import (
+    add_common_arguments,
+    add_without,
+    read_manipulations,
+    read_result_file,
+)
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.result import Description, read_result
+from dlo_calibration.files.result import Description
 from dlo_calibration.model.manipulation import Manipulation
 from dlo_calibration.observation.table import resting_level
 from dlo_calibration.planning.course import simulated_course
@@ -58,7 +63,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     for name, least, most in (('draws', 0, MOST_DRAWS), ('seed', 0, 2**32 - 1)):
         if not least <= getattr(chosen, name) <= most:
             raise InputError(f'--{name}', str(getattr(chosen, name)), f'{least} to {most}', 'correct it')
-    found = read_result(chosen.result)
+    found = read_result_file(chosen)
     manipulations, options = read_manipulations(chosen, tell, found.file_options)
     if chosen.output is not None:
         make_folder(chosen.output)  # before the simulations

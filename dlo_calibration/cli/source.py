@@ -21,6 +21,7 @@ from dlo_calibration.files.request import (
     request_manipulations,
     request_trials,
 )
+from dlo_calibration.files.result import Description, read_result
 from dlo_calibration.files.session import (
     Messages,
     read_session,
@@ -105,6 +106,21 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
                         help=f'read a topic with another name as {one_of(INPUT_TYPES, "")}, '
                         'e.g. /trackdlo/results_pc:=goal_chain; may be repeated')
     parser.add_argument('--json', action='store_true', help='print one JSON document')
+
+
+def read_result_file(chosen: argparse.Namespace) -> Description:
+    """
+    Read the RESULT.xml of a command line.
+
+    :raises InputError: if it cannot be read; with a remedy of its own if it was exchanged with the session.
+    """
+    try:
+        return read_result(chosen.result)
+    except InputError as error:
+        if is_request(chosen.session) and not is_request(chosen.result):
+            raise InputError(error.thing, error.came, error.expected,
+                             'name RESULT.xml and SESSION in the other order') from error
+        raise
 
 
 def is_request(path: Path) -> bool:

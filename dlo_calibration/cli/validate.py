@@ -17,10 +17,10 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.stages import confirmed
 from dlo_calibration.cli.output import print_result, tell
-from dlo_calibration.cli.source import add_source, read_source
+from dlo_calibration.cli.source import add_source, read_result_file, read_source
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.files.result import Description, read_result
+from dlo_calibration.files.result import Description
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.observation.rest_lengths import with_shared_places
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    file = read_result(chosen.result)
+    file = read_result_file(chosen)
     source = read_source(chosen, tell, file.file_options).require_trials()
     result = validated(file, source.trials, source.options, make_simulator)
     print_result(confirmed(result, source.options, make_simulator), chosen.json)

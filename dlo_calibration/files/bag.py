@@ -20,7 +20,7 @@ from dlo_calibration.files.yaml import read_first
 from dlo_calibration.messages.codec import INPUT_TYPES
 
 SUFFIXES = ('.mcap', '.db3', '.zstd')  # of recordings in a folder
-EXPECTED = 'an MCAP file or a rosbag2 folder'
+EXPECTED = 'an MCAP file, a rosbag2 folder, or an XML request (.xml)'
 METADATA_SIZE = 10**6  # bytes; a recording of a hundred topics in a thousand files has a third
 OPTIONS_SIZE = 10**5  # characters of recorded options; ours have 2000
 
@@ -111,7 +111,7 @@ class Bag:
                 require_file(self.path, f'session {self.path}', EXPECTED)
                 self._read_file(self.path)
         except OSError as error:
-            raise self.unusable(str(error), 'a file or a folder that can be read',
+            raise self.unusable(error.strerror or str(error), 'a file or a folder that can be read',
                                 'check the path and its permissions') from error
 
     def _read_folder(self) -> None:
@@ -178,7 +178,7 @@ class Bag:
                    f'the {len(self.records) - before[0]} message(s) before that were read'
         if sum(self.intake.counts.values()) == before[1]:
             raise self.unusable(f'a file without a readable message ({text.partition(";")[0]})', EXPECTED,
-                                'record it again')
+                                'name another file, or record it again')
         self.problems.append(text)
 
     def _read_packed(self, file: Path) -> None:

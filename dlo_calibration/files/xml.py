@@ -52,7 +52,9 @@ def read_octets(path: str | Path, what: str, suggestion: str) -> bytes:
         require_file(Path(path), where, suggestion)
         with Path(path).open('rb') as stream:
             octets = stream.read(MAXIMUM_SIZE + 1)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise InputError(where, error.strerror or str(error), suggestion, 'check the path') from error
+    except ValueError as error:
         raise InputError(where, str(error), suggestion, 'check the path') from error
     return octets
 
