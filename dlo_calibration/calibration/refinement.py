@@ -22,18 +22,13 @@ from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.linearisation import Linearisation, slope
+from dlo_calibration.evaluation.linearisation import Linearisation, slope, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
-from dlo_calibration.inference.uncertainty import (
-    correlation_length,
-    jackknife,
-    noise_alone,
-    prior_information,
-)
+from dlo_calibration.inference.cross_validation import left_out_errors
+from dlo_calibration.inference.uncertainty import noise_alone
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import BY_NAME, KNOTS, MOST_PARTS, ParameterSpace, SCALE
-from dlo_calibration.model.score import distances
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.clamps import clamp_twist, clamps
 from dlo_calibration.observation.noise import noise
@@ -41,8 +36,6 @@ from dlo_calibration.search import Hints, LeastSquares
 from dlo_calibration.search.descent import Descent
 
 STEP = 0.015  # of the finite differences by new parameters, in the unit cube
-REACH = 0.25  # furthest step for which the linear model predicts what new parameters explain
-MOST_FOLDS = 8  # of the cross-validation
 CHANCE = 0.015  # of a test, that more is taken for better though it is not
 LEAST_GAIN = 0.02  # of the logarithm of the error
 MOST_COARSE = 6  # evaluations per parameter for a coarse search
@@ -182,7 +175,7 @@ class _Ladder:
         """
         model, before = self._extended(space, start, finer, coarse), coarse.model.residuals
         here = Descent(start, model.residuals, Huber.of(before), model.jacobian)
-        if here.predicted(here.step(REACH)) > (1 - LEAST_SHARE) * here.loss.cost(before):
+        if here.predicted(here.step(WIDEST)) > (1 - LEAST_SHARE) * here.loss.cost(before):
             return None
         found = self._searched(space, Hints.at(start, model.jacobian, coarse=True))
         if found.model is None:
@@ -205,35 +198,14 @@ class _Ladder:
         return replace(model, jacobian=jacobian)
 
     def _left_out(self, space: ParameterSpace, model: Linearisation) -> Floats:
-        """
-        Return the mean point error [m] of each fold of the cross-validation.
+        """Return the mean point error [m] of each fold of the cross-validation."""
+        evaluate = self._setting.evaluate(space)
 
-        Each is predicted near the optimum of the others, after a Gauss-Newton step with a prior: without it,
-        combinations of parameters that the trials hardly determine would move far. The step is halved, twice
-        at most, until the others really fit better; where they never do, the error is that of the fit itself.
-        """
-        layout, loss, evaluate = self._layout, Huber.of(model.residuals), self._setting.evaluate(space)
-        scale = loss.deviation(model.residuals, space.dimension) * math.sqrt(
-            correlation_length(loss.clipped(model.residuals), layout))
-        weighted = model.weighted(loss.roots(model.residuals) / scale)
-        folds = layout.folds(MOST_FOLDS)
-        steps = np.clip(jackknife(weighted, folds, prior_information(space.dimension)), -REACH, REACH)
-        errors = np.array([distances(model.residuals[rows]).mean() for rows in folds])
-        unsure = list(range(len(folds)))
-        for shorter in (1.0, 0.5, 0.25):
-            points = np.clip(model.point + shorter * steps[unsure], 0.0, 1.0)
+        def residuals_at(points: Floats) -> Sequence[Floats | None]:
             self._simulated += len(points)
-            worse = []
-            for k, seen in zip(unsure, evaluate.residuals(points), strict=True):
-                others = np.delete(np.arange(len(model.residuals)), folds[k])
-                if seen is None or loss.cost(seen[others]) > loss.cost(model.residuals[others]):
-                    worse.append(k)
-                else:
-                    errors[k] = distances(seen[folds[k]]).mean()
-            unsure = worse
-            if not unsure:
-                break
-        return frozen_array(errors)
+            return evaluate.residuals(points)
+
+        return frozen_array([fold.mean() for fold in left_out_errors(model, self._layout, residuals_at)])
 
 
 def _linearised(setting: Setting, space: ParameterSpace, point: Floats, columns: NDArray[np.intp]

@@ -5,7 +5,7 @@
 Examination: simulations around the found parameters, after a search has ended.
 
 These are simulated: each parameter changed in both directions; finer nodes and
-steps; initial chains with other noise; the default parameters; the optimum of the
+steps; initial chains with other noise; the default parameters; a step towards the optimum of the
 other trials for each trial that is left out; and the ends of wide intervals.
 The module `uncertainty` computes the intervals from them.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Callable, Sequence
+from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,20 @@ from numpy.typing import NDArray
 from dlo_calibration.evaluation.linearisation import both_sides, Linearisation, slope, STEP, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.inference.cross_validation import Evaluate, left_out_errors
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
     DEVIATIONS,
-    jackknife,
     noise_alone,
     optimum_shift,
     predictive_std,
     Uncertainty,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.score import distances, PointErrors
+from dlo_calibration.model.score import PointErrors
 
 #: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
 SUSPECT = 0.01
-
-#: Takes (k, d) points, returns their residuals (m,) [m], None for a failure.
-Evaluate = Callable[[Floats], Sequence[Floats | None]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,6 @@ class Examination:
     :param noise: noise level: standard deviation of one measured coordinate, from the roughness of the
         chains [m]; nan if they have too few points.
     :param cross_validated: mean point error of trials that were left out of the fit [m]; nan with one trial.
-    :param left_out: (f,) mean point error of each fold of the cross-validation [m]; empty with one trial.
     :param default_error: mean point error of the default parameters [m]; nan if they cannot be simulated.
     :param band: (p,) standard deviation of each simulated goal point, from the covariance of the
         parameters [m].
@@ -64,7 +60,6 @@ class Examination:
     regular: bool
     noise: float
     cross_validated: float
-    left_out: Floats
     default_error: float
     band: Floats
     evaluations: int
@@ -99,7 +94,7 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     at_default, = residuals_at(default[None, :])
     fading = np.ones(len(point), bool) if fading is None else fading
     fit = _linearised(point, residuals, layout, residuals_at, noise, fading)
-    fold_errors = _left_out_errors(fit, layout, residuals_at)
+    fold_errors = left_out_errors(fit, layout, residuals_at)
     shift = None
     if finer is not None:  # late, because a worker keeps one simulator at a time
         count += 1
@@ -114,7 +109,6 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     return Examination(
         uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
         cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
-        left_out=frozen_array([float(fold.mean()) for fold in fold_errors]),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
         band=frozen_array(predictive_std(fit.jacobian, found.covariance)), evaluations=count)
 
@@ -192,13 +186,3 @@ def _converged(fit: Linearisation, found: Uncertainty) -> bool:
     count = len(free.point)
     step = free.step(np.eye(count) * found.residual**2)
     return -float(free.gradient @ step) <= 9.0 * count * found.scale**2
-
-
-def _left_out_errors(fit: Linearisation, layout: ResidualLayout, residuals_at: Evaluate) -> list[Floats]:
-    """Return the point errors [m] of each of up to 8 folds at the optimum of the others; [] for one trial."""
-    if len(layout.shapes) < 2:
-        return []
-    folds = layout.folds(8)
-    moved = jackknife(fit, folds, fit.ridge)
-    seen = residuals_at(np.clip(fit.point + np.clip(moved, -WIDEST, WIDEST), 0.0, 1.0))
-    return [distances(one[rows]) for rows, one in zip(folds, seen, strict=True) if one is not None]

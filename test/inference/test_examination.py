@@ -96,7 +96,7 @@ def test_cross_validation_is_the_error_of_refits_without_each_trial():
         left = model.at(optimum(model, others))[rows]
         distances.append(np.linalg.norm(left.reshape(-1, 3), axis=1))
     found = examined(model)
-    assert found.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=1e-6)
+    assert found.cross_validated == pytest.approx(np.concatenate(distances).mean(), rel=0.01)
     assert found.cross_validated > PointErrors.of(model.at(optimum(model))).mean
 
 
