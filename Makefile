@@ -39,7 +39,7 @@ help:
 	               then execute plans with fitted, default and true parameters: what calibration is worth
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
-	  make soak    try hostile input and faults for up to an hour, and print what was lost and what died
+	  make soak    draw ten times as many random examples as make test; try hostile input and faults: up to an hour
 	  make figures make all tables of benchmark/results: make bench, and then some hours
 	  make clean   remove .venv and everything that was built
 	END
@@ -71,8 +71,10 @@ bench: $(STAMP)
 	for name in $(if $(MEASURED),estimates discretisation accuracy); do $(PYTHON) benchmark/$$name.py; done
 	$(if $(MEASURED),,echo 'DLO_DATA names no folder: the tables of measured objects are not made again.')
 
+soak: export OPENBLAS_NUM_THREADS := 1
 soak: $(STAMP)
-	@$(PYTHON) test/soak/soak.py | tee benchmark/results/soak.md
+	@$(PYTHON) -m pytest --quiet -m hypothesis --hypothesis-profile soak --numprocesses $$(nproc)
+	$(PYTHON) test/soak/soak.py | tee benchmark/results/soak.md
 
 figures: bench
 	@$(PYTHON) benchmark/searches.py

@@ -16,6 +16,7 @@ from domain import ros_graph, WORKER
 from drawings import leave_out_drawings, leave_out_slices
 from hypothesis import settings
 import pytest
+from random_examples import USUAL
 from serial import serial
 from toy_simulator import ToySimulator
 from wire import SOURCES
@@ -24,6 +25,7 @@ from dlo_calibration.cli import main as cli
 
 # No test is timed: an example takes long where other programs keep the machine busy.
 settings.register_profile('untimed', settings(), deadline=None)
+settings.register_profile('soak', settings(), deadline=None, max_examples=10 * USUAL)
 settings.load_profile('untimed')
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -5,9 +5,10 @@
 
 import math
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import pytest
+from random_examples import drawing
 
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import declarations, FIXED_VALUES, Options
@@ -142,7 +143,7 @@ def values(declaration):
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
 
 
-@settings(max_examples=50)
+@drawing(50)
 @given(st.fixed_dictionaries({}, optional={name: values(d) for name, d in DECLARED.items()}))
 def test_flat_and_of_are_inverse(given_options):
     options = Options.of(given_options)

@@ -9,10 +9,11 @@ import json
 from pathlib import Path
 import re
 
-from hypothesis import given, reject, settings
+from hypothesis import given, reject
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from serial import serial
 from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
@@ -133,7 +134,7 @@ actions = st.one_of(
     hands().map(lambda hand: Action((hand,))))
 
 
-@settings(max_examples=25)
+@drawing(25)
 @given(initial=chains(), goal=chains(), several=st.lists(actions, min_size=1, max_size=3), name=texts,
        of_object=st.none() | texts, time=st.floats(0, 1e6), held_by=st.none() | st.lists(names, max_size=2),
        velocity=st.none() | st.tuples(numbers, numbers, numbers), mass=st.none() | st.floats(0, 1000))

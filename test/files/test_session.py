@@ -12,13 +12,14 @@ import signal
 import subprocess
 import sys
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 import numpy as np
 import pytest
+from random_examples import drawing
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from ruamel.yaml import YAML
@@ -300,7 +301,7 @@ def read_or_refuse(path):
     return found
 
 
-@settings(max_examples=30)
+@drawing(30)
 @given(place=st.floats(0, 1))
 def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_factory, place):
     octets, suffix = whole_file
@@ -313,7 +314,7 @@ def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_fac
         assert len(said) == len(EXPECTED) or found.problems
 
 
-@settings(max_examples=30)
+@drawing(30)
 @given(place=st.floats(0, 1), octets=st.binary(min_size=1, max_size=9))
 def test_damaged_anywhere_is_read_or_refused(whole_file, tmp_path_factory, place, octets):
     damaged, suffix = bytearray(whole_file[0]), whole_file[1]
@@ -324,7 +325,7 @@ def test_damaged_anywhere_is_read_or_refused(whole_file, tmp_path_factory, place
     read_or_refuse(path)
 
 
-@settings(max_examples=30)
+@drawing(30)
 @given(octets=st.binary(max_size=300), header=st.booleans())
 def test_any_bytes_are_refused(tmp_path_factory, octets, header):
     path = tmp_path_factory.mktemp('any') / 'any.mcap'

@@ -10,10 +10,11 @@ import shutil
 import subprocess
 import sys
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given, HealthCheck
 from hypothesis import strategies as st
 from live import live_node, LOG_WARN, QUICK, robot_types
 import pytest
+from random_examples import drawing
 from toy_messages import session_messages, write_session
 from toy_simulator import ToySimulator
 from wrong_input import mutations
@@ -131,7 +132,7 @@ def test_node_survives_mutated_bytes_and_calibrates_good_trials(ros_environment,
     with live_node(ros_environment, tmp_path) as robot:
         types = robot_types()
 
-        @settings(max_examples=5)
+        @drawing(5)
         @given(messages=st.lists(mutations('world'), min_size=1, max_size=12))
         def check(messages):
             robot.send(session_messages(types, 2))
@@ -342,7 +343,7 @@ def recorded_octets(tmp_path_factory):
     return file.read_bytes()
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@drawing(20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.floats(0, 1), octets=st.binary(max_size=9))
 def test_cut_or_damaged_file_ends_in_a_result_or_one_line(
         recorded_octets, tmp_path_factory, command, place, octets):

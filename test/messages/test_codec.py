@@ -7,10 +7,11 @@ from dataclasses import replace
 import subprocess
 import sys
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from wire import SOURCES, wire
 
 from dlo_calibration.errors import InputError
@@ -94,7 +95,7 @@ def layouts(draw):
 
 
 @pytest.mark.parametrize('source', SOURCES)
-@settings(max_examples=50)
+@drawing(50)
 @given(layout=layouts(), seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9))
 def test_any_layout_is_read(source, layout, seed, count):
     types = SOURCES[source]()

@@ -5,10 +5,11 @@
 
 from dataclasses import replace
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from trial_contents import anew, contents
 
 from dlo_calibration.calibration.options import Options
@@ -565,7 +566,7 @@ def feed(messages, options):
     return collector
 
 
-@settings(max_examples=80)
+@drawing(80)
 @given(session=sessions())
 def test_any_order_of_arrival_gives_the_same_trials(session):
     ordered, arrived, options = session
@@ -576,7 +577,7 @@ def test_any_order_of_arrival_gives_the_same_trials(session):
     assert list(map(str, one.problems)) == list(map(str, other.problems))
 
 
-@settings(max_examples=40)
+@drawing(40)
 @given(session=sessions(), again=st.data())
 def test_messages_sent_twice_change_nothing(session, again):
     ordered, arrived, options = session

@@ -8,11 +8,12 @@ import functools
 import itertools
 from types import SimpleNamespace
 
-from hypothesis import given, HealthCheck, settings
+from hypothesis import given, HealthCheck
 from hypothesis import strategies as st
 from live import live_node, LOG_WARN, QUICK
 import numpy as np
 import pytest
+from random_examples import drawing
 from toy_messages import SECOND, session_messages, write_session
 from toy_simulator import new_toy
 from trial_contents import contents
@@ -217,7 +218,7 @@ def collected(messages):
     return collector
 
 
-@settings(max_examples=50)
+@drawing(50)
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
 def test_mutated_bytes_are_collected_or_refused(messages):
     collector = collected([
@@ -227,7 +228,7 @@ def test_mutated_bytes_are_collected_or_refused(messages):
         score_of(collector.trials)
 
 
-@settings(max_examples=50)
+@drawing(50)
 @given(data=st.data())
 def test_mutated_fields_are_collected_or_refused(data):
     originals = fuzzed_pairs(FILES, 'world')
@@ -239,7 +240,7 @@ def test_mutated_fields_are_collected_or_refused(data):
         score_of(collector.trials)
 
 
-@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@drawing(10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('camera'), min_size=1, max_size=12))
 def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     for kind, octets in messages:
@@ -248,7 +249,7 @@ def test_mutated_bytes_on_topics_leave_the_good_trials(topics, messages):
     assert topics.robot.status['trials'] == '2'
 
 
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@drawing(15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6), good_last=st.booleans())
 def test_mutated_bytes_in_a_file_end_in_a_result_or_one_line(tmp_path_factory, command, messages, good_last):
     path = tmp_path_factory.mktemp('mutated') / 'session.mcap'

@@ -7,9 +7,10 @@ import math
 import subprocess
 import sys
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import pytest
+from random_examples import drawing
 
 from dlo_calibration import InputError
 from dlo_calibration.model.parameters import BY_NAME, PARAMETERS, ParameterSpace, PART_NAMES, REST_SHAPE
@@ -41,7 +42,7 @@ def test_the_ends_of_the_scale(name, at_zero, at_hundred, unit):
 
 
 @pytest.mark.parametrize('parameter', PARAMETERS, ids=lambda parameter: parameter.name)
-@settings(max_examples=20)
+@drawing(20)
 @given(u=st.floats(0, 100), v=st.floats(0, 100))
 def test_every_scale_is_monotonic_and_can_be_inverted(parameter, u, v):
     assert parameter.value(parameter.physical(u)) == pytest.approx(u, abs=1e-9)

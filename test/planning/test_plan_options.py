@@ -5,9 +5,10 @@
 
 import argparse
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import pytest
+from random_examples import drawing
 
 from dlo_calibration import InputError, Options
 from dlo_calibration.calibration.declaration import MACHINE, SEARCH
@@ -58,7 +59,7 @@ def test_every_option_is_declared_completely(declaration):
             PlanOptions.of({declaration.name: wrong})
 
 
-@settings(max_examples=50)
+@drawing(50)
 @given(st.fixed_dictionaries({}, optional={name: values(one) for name, one in DECLARED.items()}))
 def test_flat_and_of_are_inverse(chosen):
     options = PlanOptions.of(chosen)

@@ -5,11 +5,12 @@
 
 from pathlib import Path
 
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
 import oracles
 import pytest
+from random_examples import drawing
 from stepping import SteppedRod, Touching
 from test_rod import crumpled, GRAVITY, straight
 
@@ -35,7 +36,7 @@ def some_properties(generator, curvature):
         generator.uniform(0, 1), (1.0, *generator.uniform(0.2, 5, generator.integers(0, 6))))
 
 
-@settings(derandomize=True, max_examples=40)
+@drawing(40, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40), st.integers(0, 5),
        st.one_of(st.just(0.0), st.floats(0.01, 10)), st.floats(0.02, 0.3))
 def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, size):
@@ -55,7 +56,7 @@ def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, s
     assert np.abs(got - expected).max() < 1e-8 * max(1, np.abs(expected).max())
 
 
-@settings(derandomize=True, max_examples=40)
+@drawing(40, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(8, 30), st.floats(0.003, 0.02), st.floats(0, 2), st.booleans())
 def test_the_compiled_contacts_are_those_of_the_capsules(seed, segments, radius, friction, supported):
     generator = np.random.default_rng(seed)

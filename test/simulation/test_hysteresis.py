@@ -3,10 +3,11 @@
 
 """Friction between the strands of a DLO: loops of moment and curvature, energy, and bends that stay."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
@@ -63,7 +64,7 @@ def stored(rod, points):
     return (state.rows[:, 3] * (state.kept[:, 6:]**2).sum(axis=1)).sum() / 2
 
 
-@settings(derandomize=True, max_examples=30)
+@drawing(30, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 30), st.floats(0.001, 10),
        st.sampled_from([0.001, 0.004, 0.01]))
 def test_friction_never_gains_energy(seed, bending, kept, slip, step):

@@ -3,11 +3,12 @@
 
 """A DLO that is coiled: its energy and forces, and the circle that it curls to."""
 
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
 from oracles import frame_forces, least_energy
 import pytest
+from random_examples import drawing
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
@@ -72,7 +73,7 @@ def tight(points):
     return (1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 <= 2 * kernels.HAIRPIN
 
 
-@settings(derandomize=True, max_examples=12)
+@drawing(12, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([0.0, 0.1, 1.0, 10.0]),
        st.sampled_from([(), (4,), (0, 1), (3, 4), (0, 1, 8, 9), (0, 1, 4, 5, 6, 8, 9)]))
 def test_forces_of_the_material_frame_are_the_slope_of_its_least_energy(seed, wild, torsion, held):
@@ -97,7 +98,7 @@ def test_forces_of_the_material_frame_are_the_slope_of_its_least_energy(seed, wi
             assert got[index] == pytest.approx(expected, abs=1e-5 * np.abs(got).max())
 
 
-@settings(derandomize=True, max_examples=10)
+@drawing(10, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(0.1, 10.0), st.sampled_from([0.001, 0.004]),
        st.sampled_from([0.0, 0.3]))
 def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step, torsion):
@@ -121,7 +122,7 @@ def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step, tors
     assert total() < start
 
 
-@settings(derandomize=True, max_examples=10)
+@drawing(10, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
 def test_a_coiled_rod_neither_flies_away_nor_begins_to_spin(seed):
     rest = np.random.default_rng(seed).uniform(0.02, 0.05, 12)

@@ -3,10 +3,11 @@
 
 """The rod's forces and steps against mechanics: energies, momentum, and textbook deflections."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from stepping import SteppedRod as Rod
 
 from dlo_calibration.errors import SimulationError
@@ -45,7 +46,7 @@ def energy(points, rest, properties):
         properties.bending_stiffness / (2 * cells) * bend**2).sum()
 
 
-@settings(derandomize=True, max_examples=10)
+@drawing(10, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_forces_are_the_slope_of_the_energy(seed, equal):
     generator = np.random.default_rng(seed)
@@ -83,7 +84,7 @@ def test_free_fall():
     assert velocities == pytest.approx(np.tile((0.3, -0.2, 0.1 - 9.81 * 0.2), (11, 1)), abs=1e-9)
 
 
-@settings(derandomize=True, max_examples=30)
+@drawing(30, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.1))
 def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
     generator = np.random.default_rng(seed)
@@ -98,7 +99,7 @@ def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
     assert rod.state.masses @ velocities == pytest.approx(before, abs=1e-10)
 
 
-@settings(derandomize=True, max_examples=30)
+@drawing(30, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(10, 1e4),
        st.sampled_from([0.001, 0.005, 0.02]))
 def test_energy_never_grows(seed, bending, stretching, step):

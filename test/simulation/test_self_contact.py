@@ -3,10 +3,11 @@
 
 """Contact of a DLO with itself: two strands of one, pushed together and along each other."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_examples import drawing
 from stepping import SteppedRod, Touching
 
 from dlo_calibration.simulation.rod import RodProperties
@@ -81,20 +82,20 @@ def nearest(angle, speed, friction, gap):
     return least
 
 
-@settings(derandomize=True, max_examples=20)
+@drawing(20, derandomize=True)
 @given(st.floats(0.4, 1.5), st.sampled_from([-1, 1]), st.floats(0, 2), st.floats(0, 1),
        st.floats(0.012, 0.03))
 def test_crossing_strands_do_not_pass_through_each_other(angle, side, speed, friction, gap):
     assert 0.75 * 2 * RADIUS < nearest(side * angle, speed, friction, gap) < 1.2 * 2 * RADIUS
 
 
-@settings(derandomize=True, max_examples=20)
+@drawing(20, derandomize=True)
 @given(st.floats(-0.3, 0.3), st.floats(0, 0.5), st.floats(0, 1), st.floats(0.012, 0.03))
 def test_strands_along_each_other_do_not_pass_through_each_other(angle, speed, friction, gap):
     assert nearest(angle, speed, friction, gap) > 0.5 * 2 * RADIUS
 
 
-@settings(derandomize=True, max_examples=25)
+@drawing(25, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(-1.5, 1.5), st.floats(0, 1))
 def test_contacts_conserve_momentum(seed, angle, friction):
     points, places = strands(0.011, angle)

@@ -30,7 +30,7 @@ from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types
 
-SHORT, FULL = 1, 45
+FULL = 45
 PATIENCE = 90.0  # s for a process
 SIZES = 4, 600  # kB; the largest has room for all files of most commands
 SMALL = {'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,

@@ -32,7 +32,7 @@ from dlo_calibration.messages.codec import (
 )
 from dlo_calibration.model.chain import Chain, MOST_POINTS
 
-SHORT, FULL = 1, 130
+FULL = 130
 BURST = 3000  # messages, or as many as these bytes hold
 BURST_BYTES = 60_000_000
 LATER = 1000  # s, stamp of the first burst

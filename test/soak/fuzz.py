@@ -34,7 +34,7 @@ from dlo_calibration.files.request import Request, TrialRequest, write_request
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
 
-SHORT, FULL = 1, 200  # rounds, of about three seconds each
+FULL = 200  # rounds, of about three seconds each
 MESSAGES = 50  # mutated ones a round for the reader
 FLOOD = 2000  # mutated ones for a node in another process, in the full form
 TYPES = bag_types()

@@ -33,7 +33,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.messages.codec import bag_types
 
-SHORT, FULL = 2, 110
+FULL = 110
 PATIENCE = 60.0  # s from the signal to the end of the process
 ORPHANED = 5.0  # s that a child process may outlive its parent
 SMALL = {'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2,

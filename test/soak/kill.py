@@ -27,7 +27,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session, session_trials
 
-SHORT, FULL = 1, 110
+FULL = 110
 ORPHANED = 5.0  # s that a process may outlive the node
 MOMENTS = ('calibrating', 'a process', 'writing', 'collecting')
 EVALUATIONS = {'calibrating': 10000, 'a process': 60, 'writing': 20, 'collecting': 20}

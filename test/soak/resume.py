@@ -29,7 +29,7 @@ import witness
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
 
-SHORT, FULL = 1, 14
+FULL = 14
 PATIENCE = 120.0  # s that a process may take
 MOST = 4  # kills of one calibration
 SMALL = {'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.3}
@@ -80,7 +80,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             of_node(place, tally, choose)
         else:
             choice = CHOICES[turn % NODE_TURN % len(CHOICES)]
-            of_fit(place, tally, choose, choice, *((MOST, 2) if amount > SHORT else (1, 1)))
+            of_fit(place, tally, choose, choice, *((MOST, 2) if amount > 1 else (1, 1)))
     return tally
 
 

@@ -19,7 +19,7 @@ import time
 import numpy as np
 from tally import finish, Tally, verb
 
-SHORT, FULL = 10, 1200
+FULL = 1200
 EACH_FIT = 120  # scenes for each one that `fit` gets, too
 LIMIT = 120.0  # s for one scene; one that takes longer hangs
 
@@ -256,7 +256,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
             number = begun + 1
         else:
             number = amount
-    for number in range(0, amount, EACH_FIT):
+    for number in range(EACH_FIT - 1, amount, EACH_FIT):
         _fit(folder, number, seed, tally)
     return tally
 

@@ -4,8 +4,8 @@
 """
 Soak: hostile input and injected faults, an hour at most; prints a table of what was lost and what died.
 
-A campaign is a module beside this one, with `SHORT` and `FULL` (how much to try, in `make test` and
-here) and `conduct(amount, seed, folder)`, which returns a `Tally`.
+A campaign is a module beside this one, with `FULL`, how much to try, and `conduct(amount, seed, folder)`,
+which returns a `Tally`.
 
     python test/soak/soak.py [--seed S] [--amount N] [CAMPAIGN ...]
 """
