@@ -143,7 +143,7 @@ def values(declaration):
     return st.sampled_from(declaration.choices) if declaration.choices else st.text()
 
 
-@drawing(50)
+@drawing(25)
 @given(st.fixed_dictionaries({}, optional={name: values(d) for name, d in DECLARED.items()}))
 def test_flat_and_of_are_inverse(given_options):
     options = Options.of(given_options)

@@ -301,7 +301,7 @@ def read_or_refuse(path):
     return found
 
 
-@drawing(30)
+@drawing(15)
 @given(place=st.floats(0, 1))
 def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_factory, place):
     octets, suffix = whole_file
@@ -314,7 +314,7 @@ def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_fac
         assert len(said) == len(EXPECTED) or found.problems
 
 
-@drawing(30)
+@drawing(15)
 @given(place=st.floats(0, 1), octets=st.binary(min_size=1, max_size=9))
 def test_damaged_anywhere_is_read_or_refused(whole_file, tmp_path_factory, place, octets):
     damaged, suffix = bytearray(whole_file[0]), whole_file[1]
@@ -325,7 +325,7 @@ def test_damaged_anywhere_is_read_or_refused(whole_file, tmp_path_factory, place
     read_or_refuse(path)
 
 
-@drawing(30)
+@drawing(15)
 @given(octets=st.binary(max_size=300), header=st.booleans())
 def test_any_bytes_are_refused(tmp_path_factory, octets, header):
     path = tmp_path_factory.mktemp('any') / 'any.mcap'

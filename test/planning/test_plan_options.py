@@ -59,7 +59,7 @@ def test_every_option_is_declared_completely(declaration):
             PlanOptions.of({declaration.name: wrong})
 
 
-@drawing(50)
+@drawing(25)
 @given(st.fixed_dictionaries({}, optional={name: values(one) for name, one in DECLARED.items()}))
 def test_flat_and_of_are_inverse(chosen):
     options = PlanOptions.of(chosen)

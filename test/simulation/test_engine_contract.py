@@ -3,11 +3,13 @@
 
 """One contract for every engine: analytic solutions, and what must never happen."""
 
+from contextlib import closing
 import functools
 import hashlib
 import json
 from pathlib import Path
 import pickle
+import re
 import subprocess
 import sys
 
@@ -93,7 +95,7 @@ def elastica_tip(stiffness, load, length):
 
 
 @pytest.mark.parametrize('stiffness', [0.5, 0.05, 0.005])
-@pytest.mark.parametrize('count', [12, 31, 50])
+@pytest.mark.parametrize('count', [12, 31])
 def test_cantilever_tip_is_the_elastica(make, stiffness, count):
     clamp = 0.01
     places = np.append(0.0, clamp + np.linspace(0, 1, count - 1))
@@ -308,15 +310,30 @@ def test_two_at_a_time_do_not_disturb_each_other(make):
     assert rollout(engine).chains.tobytes() == alone.chains.tobytes()
 
 
-@pytest.mark.parametrize('name', [parameter.name for parameter in PARAMETERS])
-def test_every_parameter_changes_the_rollout(make, name):
+@functools.cache
+def chains_of(factory, **changed):
+    """Return the chains of a rollout with some parameters changed; with clamps for what only they show."""
+    clamps = not {'torsion', 'clamp_twist'}.isdisjoint(changed)
+    with closing(factory(time_step=TIME_STEP, **{**SMALL, 'nodes': 15 if clamps else 21})) as engine:
+        # With no node between the points that clamps hold.
+        given = fold_trial(('hand', 'other'), clamps=True) if clamps else fold_trial()
+        return rollout(engine, given, **changed).chains
+
+
+def tried_parameters():
+    """List engines and parameters; of those that differ in a number only, Bullet gets the first."""
+    for parameter in PARAMETERS:
+        yield CompiledSimulator, parameter.name
+        if not re.search('[3-9]$', parameter.name) and not re.search('x2|y2', parameter.name):
+            yield BulletSimulator, parameter.name
+
+
+@pytest.mark.parametrize(('factory', 'name'), list(tried_parameters()))
+def test_every_parameter_changes_the_rollout(factory, name):
     # Internal damping that is less than the time step's own does nothing.
-    values = (40.0, 90.0) if name == 'internal_damping' else (MIDDLE[name] - 20, MIDDLE[name] + 20)
-    engine, given = make(**SMALL), fold_trial()
-    if name in ('torsion', 'clamp_twist'):  # of what clamps hold, with no node between their points
-        engine, given = make(**{**SMALL, 'nodes': 15}), fold_trial(('hand', 'other'), clamps=True)
-    low, high = (rollout(engine, given, **{name: value}).chains for value in values)
-    assert np.abs(high - low).max() > 1e-4
+    value = 90.0 if name == 'internal_damping' else MIDDLE[name] + 20
+    same = {name: MIDDLE[name]} if name in ('torsion', 'clamp_twist') else {}
+    assert np.abs(chains_of(factory, **{name: value}) - chains_of(factory, **same)).max() > 1e-4
 
 
 def test_a_held_end_stays_with_its_hand_and_a_released_one_does_not(make):

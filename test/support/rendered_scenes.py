@@ -210,8 +210,9 @@ def distances(scene, pixels, count=21):
     # A pixel belongs to the strand near its own place along the line, also at crossings.
     fine = np.linspace(0, 1, 4000)
     strand = np.column_stack([np.interp(fine, along, column) for column in truth.T])
-    near = np.abs(fine[None] - share[:, None]) < 0.06
-    off = np.where(near, np.linalg.norm(flat[:, None] - strand[None], axis=2), np.inf).min(axis=1)
+    near = np.round(share[:, None] * (len(fine) - 1)).astype(int) + np.arange(-240, 241)
+    near = np.clip(near, 0, len(fine) - 1)
+    off = np.linalg.norm(flat[:, None] - strand[near], axis=2).min(axis=1)
     return np.linalg.norm(evenly[0] - evenly[1], axis=1), off
 
 
