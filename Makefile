@@ -73,7 +73,7 @@ bench: $(STAMP)
 
 soak: export OPENBLAS_NUM_THREADS := 1
 soak: $(STAMP)
-	@$(PYTHON) -m pytest --quiet -m hypothesis --hypothesis-profile soak --numprocesses $$(nproc)
+	@$(PYTHON) -m pytest --quiet -m 'hypothesis or long' --hypothesis-profile soak --numprocesses $$(nproc)
 	$(PYTHON) test/soak/soak.py | tee benchmark/results/soak.md
 
 figures: bench

@@ -12,7 +12,6 @@ from typing import Callable, Iterator, Protocol, Sequence, TextIO, TypeVar
 
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.experiment.journal import Done, Journal, Recorded
-from dlo_calibration.report.terminal import TaskBar
 
 TOLD = 30.0  # s between two sentences on what is left, in a log file
 
@@ -42,6 +41,8 @@ def perform_all(what: str, tasks: Sequence[AnyTask], journal: Journal[Done], per
     :param note: called with each sentence for the user.
     :param stream: for a progress bar.
     """
+    from dlo_calibration.report.terminal import TaskBar
+
     waiting = [task for task in tasks if journal.find(task) is None]
     total = len(tasks)
     if not waiting:

@@ -27,9 +27,8 @@ from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SI
 from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
-from dlo_calibration.report.rows import parameter_rows
+from dlo_calibration.report.rows import fit_facts, parameter_rows
 from dlo_calibration.report.sentences import lower_score, MEAN_DISTANCE, sentences, verdict
-from dlo_calibration.report.terminal import fit_facts
 from dlo_calibration.writing import whole
 
 MOST_TRIALS = 12  # are drawn, so that the page stays small

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rows: the parameters of a result as texts of a table; a knot of the rest shape is one row."""
+"""Rows: the parameters of a result and facts about its fit as texts of tables; a knot is one row."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, Mapping
 
 from dlo_calibration.model.parameters import BY_NAME, knot_names, ParameterSpace
 from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 
 
 @dataclass(frozen=True)
@@ -70,3 +71,28 @@ def _knot(name: str, quantity: str, *pair: Mapping[str, Any]) -> Row:
         f'{ends("physical_")} {unit}',
         max(pair, key=lambda one: float(one['std']))['verdict'],
         '; '.join(dict.fromkeys(one['note'] for one in pair if one['note'])))
+
+
+def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return facts about the fit and the search, as pairs of texts, from the plain values of a result."""
+    facts = [
+        ('difference score', f'{number(values["score"])} cm (below {SIMILAR:g}: similar, '
+                             f'below {VERY_SIMILAR:g}: very similar)'),
+        ('mean error', f'{measured(values["mean_error_m"], "m")} '
+                       f'({number(values["error_percent_of_length"])} % of the length)'),
+        ('rms error', measured(values['rms_error_m'], 'm')),
+        ('largest error', measured(values['max_error_m'], 'm')),
+        ('trials', str(values['trials'])),
+        ('evaluations', f'{values["evaluations"]} ({values["simulations"]} simulations) '
+                        f'in {number(values["seconds"])} s'),
+        ('search', f'{values["search"] or "-"}, seed {"-" if values["seed"] is None else values["seed"]}'),
+        ('engine', values['engine'])]
+    other = values['confirmation']
+    if other is not None:
+        facts.append((
+            f'confirmed by {other["engine"]}',
+            f'difference score {number(other["score"])} cm, '
+            f'mean error {measured(other["mean_error_m"], "m")}; '
+            f'points {measured(other["mean_distance_m"], "m")} from those of {values["engine"]}, '
+            f'{measured(other["max_distance_m"], "m")} at most'))
+    return [*facts, ('ended', values['stop_reason'])]

@@ -19,10 +19,9 @@ from dlo_calibration.errors import shortened, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.quantity import measured, number
-from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.planning.planner import PlanProgress
 from dlo_calibration.report import sentences
-from dlo_calibration.report.rows import parameter_rows
+from dlo_calibration.report.rows import fit_facts, parameter_rows
 
 LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
 
@@ -163,31 +162,6 @@ def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -
     for row in rows:
         table.add_row(*(escape(text) for text in row))
     return table
-
-
-def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return facts about the fit and the search, as pairs of texts, from the plain values of a result."""
-    facts = [
-        ('difference score', f'{number(values["score"])} cm (below {SIMILAR:g}: similar, '
-                             f'below {VERY_SIMILAR:g}: very similar)'),
-        ('mean error', f'{measured(values["mean_error_m"], "m")} '
-                       f'({number(values["error_percent_of_length"])} % of the length)'),
-        ('rms error', measured(values['rms_error_m'], 'm')),
-        ('largest error', measured(values['max_error_m'], 'm')),
-        ('trials', str(values['trials'])),
-        ('evaluations', f'{values["evaluations"]} ({values["simulations"]} simulations) '
-                        f'in {number(values["seconds"])} s'),
-        ('search', f'{values["search"] or "-"}, seed {"-" if values["seed"] is None else values["seed"]}'),
-        ('engine', values['engine'])]
-    other = values['confirmation']
-    if other is not None:
-        facts.append((
-            f'confirmed by {other["engine"]}',
-            f'difference score {number(other["score"])} cm, '
-            f'mean error {measured(other["mean_error_m"], "m")}; '
-            f'points {measured(other["mean_distance_m"], "m")} from those of {values["engine"]}, '
-            f'{measured(other["max_distance_m"], "m")} at most'))
-    return [*facts, ('ended', values['stop_reason'])]
 
 
 def print_result(result: CalibrationResult, stream: TextIO,

@@ -65,6 +65,7 @@ def test_the_same_in_parts_is_the_same_dlo(found):
     assert again.score == pytest.approx(seen[even.index].score, rel=1e-6)
 
 
+@pytest.mark.long
 def test_an_even_dlo_stays_in_one_part():
     result = calibrated(observed(EVEN, TRUTH))
     assert result.space.free == EVEN.free

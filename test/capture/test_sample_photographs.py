@@ -41,6 +41,7 @@ def test_chains_of_the_sample_are_those_of_the_simulated_rope(interpretation):
         assert chain.length == pytest.approx(TRUTH['length_m'], rel=0.005)
 
 
+@pytest.mark.long
 def test_parameters_of_the_sample_lie_in_their_intervals(interpretation):
     read, _ = interpretation
     options = Options.of({**read.options, 'engine': 'compiled', 'workers': 1, 'evaluations': 80})

@@ -354,7 +354,7 @@ def test_the_board_can_be_printed_from_the_page_and_the_command_line(shared, tmp
 
 def test_kill_loses_nothing_and_a_signal_ends_it_well(tmp_path):
     folder = tmp_path / 'project'
-    words = '--evaluations', 100000, '--engine', 'compiled', '--workers', 1
+    words = '--evaluations', 100000, '--search', 'random', '--workers', 1
     with apart(folder, *words) as (page, process):
         before = whole_trial(page)
         page.done('POST', 'api/calibrate')

@@ -50,6 +50,7 @@ def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path
     assert read_session(folder).problems == ()
 
 
+@pytest.mark.long
 def test_interrupted_demo_leaves_no_node_behind(ros_environment, tmp_path):
     process = demo(ros_environment, '--output', str(tmp_path / 'out'), '--evaluations', '1000')
     begun = time.monotonic()

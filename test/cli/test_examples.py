@@ -11,6 +11,7 @@ import subprocess
 import sys
 
 from graph import child, ended
+import pytest
 
 from dlo_calibration.files.session import read_session
 
@@ -60,6 +61,7 @@ def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environmen
     assert 'the planner says: The DLO is at the goal already' in heard
 
 
+@pytest.mark.long
 def test_robot_arm_carries_the_rope_without_stretching_it():
     heard = example(dict(os.environ), 'robot_arm.py', '--pace', '4')
     largest, = re.findall(r'The largest stretch was ([\d.]+) %', heard)

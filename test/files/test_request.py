@@ -402,6 +402,7 @@ def test_sample_is_explained_by_its_parameters(file, capsys):
     assert found['error_percent_of_length'] < 2
 
 
+@pytest.mark.long
 def test_sample_is_fitted(capsys):
     code = cli.main(['fit', str(SAMPLES / 'named_actions.xml'), '--json', '--evaluations', '3',
                      '--engine', 'compiled', '--workers', '1'])

@@ -21,7 +21,7 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, INPUT_TYPES, read
+from dlo_calibration.messages.codec import ACTION, bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.planning.checks import checked
@@ -131,9 +131,9 @@ def test_yaml_messages_show_the_first_trial_of_object1(types):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=0.501e-4)
 
 
-def test_yaml_messages_calibrate(types):
+def test_yaml_messages_calibrate():
     simulator = BulletSimulator(nodes=12, time_step=0.01)
-    result = fitted(sample_trials(sample_messages(types)), ParameterSpace(mass=0.03), simulator,
+    result = fitted(sample_trials(sample_messages(bag_types())), ParameterSpace(mass=0.03), simulator,
                        RandomSearch(4, seed=1), budget=2)
     simulator.close()
     assert len(result.evaluations) == 2

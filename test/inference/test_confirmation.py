@@ -25,7 +25,7 @@ from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
 from dlo_calibration.report.page import Origin, write_report
-from dlo_calibration.report.terminal import fit_facts
+from dlo_calibration.report.rows import fit_facts
 from dlo_calibration.ros import diagnostics
 from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.simulation.protocol import Rollout

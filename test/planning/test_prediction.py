@@ -90,6 +90,7 @@ def test_a_finer_simulation_tells_how_rough_the_usual_one_is():
     assert (coarse.upper - coarse.lower).mean() > 2 * (usual.upper - usual.lower).mean()
 
 
+@pytest.mark.long
 def test_90_percent_of_the_points_of_a_trial_that_was_left_out_are_in_their_intervals():
     options = Options.of({'mass': 0.03, 'calibrate': ['flexibility', 'friction'], 'workers': 1})
     trials, _ = session_trials(read_session(samples() / 'object1'), options)

@@ -7,7 +7,6 @@ import argparse
 from contextlib import contextmanager
 import json
 import os
-from pathlib import Path
 import subprocess
 import sys
 import threading
@@ -19,6 +18,7 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
+import toy_command
 from toy_simulator import ToySimulator
 
 from dlo_calibration.capture import information
@@ -26,7 +26,6 @@ from dlo_calibration.cli import capture
 from dlo_calibration.inference.trial_information import TrialInformation
 
 PATIENCE = 60.0  # s
-ROOT = Path(__file__).resolve().parents[2]
 SIZE = 400, 300  # px: small, so that tracing takes no time
 PER_METRE = 625.0  # px, seen straight from above
 DIAMETER = 0.012  # m
@@ -200,11 +199,11 @@ def served(folder, *words, simulator=ToySimulator, appraising=False):
 
 @contextmanager
 def apart(folder, *words):
-    """Give the page of a folder, and the process that serves it with the real engine."""
+    """Give the page of a folder, and the process that serves it with the toy."""
     process = subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration', 'capture', str(folder), '--no-browser', '--workers', '1',
-         *map(str, words)], env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True)
+        [sys.executable, toy_command.__file__, '0.01', 'capture', str(folder), '--no-browser',
+         '--workers', '1', *map(str, words)], env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()
         assert line, process.stderr.read()
