@@ -1,0 +1,243 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""ExportedRope: a calibrated DLO at an observed chain, as every format for another simulator needs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Mapping
+
+import numpy as np
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
+from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
+from dlo_calibration.model.bending import natural_curvature
+from dlo_calibration.model.chain import Chain, Floats, frozen_array
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.model.quantity import measured
+from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
+from dlo_calibration.observation.table import lying_level, rest_on
+from dlo_calibration.planning.dlo import CalibratedDlo
+from dlo_calibration.planning.prediction import MOST_POINTS
+from dlo_calibration.simulation.nodes import feature_shares, spread_places
+from dlo_calibration.simulation.rod import RodProperties
+
+LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a remark
+LENGTH_TOLERANCE = 0.05  # of the length; a chain that differs by more may belong to another DLO
+
+
+@dataclass(frozen=True)
+class ExportedRope:
+    """
+    A DLO of n nodes; inner node j, of n - 2, lies between segments j and j + 1.  All values in SI units.
+
+    :param points: (n, 3) nodes at the start [m]: the chain without its noise; those that rest on the table
+        lie exactly on it.
+    :param rest_lengths: (n - 1,) of the segments [m].
+    :param masses: (n - 1,) of the segments [kg]; `marker_masses` (n,) in addition, at the nodes.
+    :param radius: [m].
+    :param bending_stiffness: (n - 2,) EI at the inner nodes [N m^2].
+    :param stretching_stiffness: EA [N].
+    :param twisting_stiffness: (n - 2,) GJ at the inner nodes [N m^2]; None: the trials were simulated without
+        resistance to twist.
+    :param natural_curvature: (n - 2, 2) components of the curvature of the rest shape in `frames` [1/m].
+    :param frames: (n - 1, 3, 3) material frame of each segment at the start, its columns the direction of the
+        segment and two across it, not twisted; turned about the DLO so that the start bends it least.
+    :param clamp_twist: angle between the rest shape and a second clamp [rad].
+    :param drag: acceleration against the velocity, relative to it [1/s].
+    :param internal_damping: damping of bending and stretching, relative to their stiffness [s].
+    :param friction: Coulomb coefficient of the DLO with the table and with itself.
+    :param bending_friction: largest moment of friction between strands, relative to EI [1/m]; 0: none.
+    :param bending_slip: change of curvature at which they slip [1/m].
+    :param table: height of the table [m]; None: there is none.
+    :param point_places: (m,) arc lengths of the points of the chain at rest [m], from 0.
+    :param values: a line for each found parameter: value, 90 % interval, verdict.
+    :param remarks: sentences: which parameters the trials do not determine, and what was assumed.
+    """
+
+    points: Floats
+    rest_lengths: Floats
+    masses: Floats
+    marker_masses: Floats
+    radius: float
+    bending_stiffness: Floats
+    stretching_stiffness: float
+    twisting_stiffness: Floats | None
+    natural_curvature: Floats
+    frames: Floats
+    clamp_twist: float
+    drag: float
+    internal_damping: float
+    friction: float
+    bending_friction: float
+    bending_slip: float
+    table: float | None
+    point_places: Floats
+    values: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def cells(self) -> Floats:
+        """Length that bends at each inner node, (n - 2,) [m]: the stiffness of a joint there is EI / cell."""
+        return np.asarray((self.rest_lengths[:-1] + self.rest_lengths[1:]) / 2)
+
+    @property
+    def length(self) -> float:
+        """Length at rest [m]."""
+        return float(self.rest_lengths.sum())
+
+    def place_of(self, place: float) -> tuple[int, float]:
+        """Return the segment at an arc length [m], and how far from its first node it is [m]."""
+        ends = np.concatenate([[0.0], np.cumsum(self.rest_lengths)])
+        segment = int(np.clip(np.searchsorted(ends, place, side='right') - 1, 0, len(ends) - 2))
+        return segment, float(min(max(place - ends[segment], 0.0), self.rest_lengths[segment]))
+
+    @classmethod
+    def of(cls, found: CalibratedDlo, chain: Chain, options: Options | None = None) -> ExportedRope:
+        """
+        Return a calibrated DLO at an observed chain.
+
+        :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+        :param options: `nodes`, `table` and `table_height` are used; None: the defaults.
+        :raises InputError: if the chain has too many points.
+        """
+        options = options or Options()
+        if len(chain) > MOST_POINTS:
+            raise InputError('export', f'a chain of {len(chain)} points', f'at most {MOST_POINTS}',
+                             'resample it to fewer points')
+        physical = found.space.physical({name: one.value for name, one in found.parameters.items()},
+                                        found.length)
+        rod, radius = RodProperties.of(physical), physical['self_collision']
+        level = lying_level(chain, options.table_height) if options.table else None
+        chain = _without_noise(chain)
+        places = spread_places(np.array([0.0, chain.length]), options.nodes)
+        points = chain.resample(places)
+        if level is not None:
+            points = rest_on(points, level)
+        lengths = np.diff(places) * rod.length_scale
+        ends = np.concatenate([[0.0], np.cumsum(lengths)])
+        stiffness = rod.bending_stiffness * _relative_stiffness(ends, rod.profile)
+        natural = natural_curvature(physical, ends[1:-1] / ends[-1])
+        return cls(
+            points=frozen_array(points), rest_lengths=frozen_array(lengths), radius=radius,
+            masses=frozen_array(rod.mass * lengths / ends[-1]),
+            marker_masses=frozen_array(rod.marker_mass * feature_shares(chain, places)),
+            bending_stiffness=frozen_array(stiffness), stretching_stiffness=rod.stretching_stiffness,
+            twisting_stiffness=frozen_array(rod.torsion * stiffness) if rod.torsion > 0 else None,
+            natural_curvature=frozen_array(natural),
+            frames=frozen_array(_material_frames(points, stiffness[:, None] * natural)),
+            clamp_twist=rod.clamp_twist, drag=rod.drag, internal_damping=rod.internal_damping,
+            friction=physical['friction'], bending_friction=rod.bending_friction,
+            bending_slip=rod.bending_slip,
+            table=None if not options.table else options.table_height if level is None else level - radius,
+            point_places=frozen_array(chain.arc_lengths() * rod.length_scale), values=_values(found),
+            remarks=(*_undetermined(found), *_assumed(found, physical, chain),
+                     *_about_table(level, radius, options)))
+
+
+def _without_noise(chain: Chain) -> Chain:
+    """Return a chain smoothed according to its own noise level: noise makes a chain longer, and bends it."""
+    level = noise_of([chain.points[None]])
+    return Chain(smooth(chain.points, level), features=chain.features) if level > NO_NOISE else chain
+
+
+def _relative_stiffness(ends: Floats, profile: tuple[float, ...]) -> Floats:
+    """
+    Return the bending stiffness at the inner nodes, (n - 2,), relative to that of the first part.
+
+    Around a node, from the middle of one segment to the middle of the next, pieces of different stiffness
+    bend one after the other, as in `simulation.rod`.
+
+    :param ends: (n,) arc lengths of the nodes [m].
+    :param profile: stiffness of parts of equal length, relative to the first one.
+    """
+    bounds = np.linspace(0, ends[-1], len(profile) + 1)
+    bend = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / profile)])
+    middles = (ends[1:] + ends[:-1]) / 2
+    return np.asarray(np.diff(middles) / np.diff(np.interp(middles, bounds, bend)))
+
+
+def _material_frames(points: Floats, moments: Floats) -> Floats:
+    """
+    Return a frame of each segment, (n - 1, 3, 3).
+
+    It is carried along without twist (Bishop, There is more than one way to frame a curve, 1975).  As a
+    whole, it is turned about the DLO to the angle of least bending energy: that at which `moments` of the
+    rest shape agree best with how the DLO is bent.
+
+    :param points: (n, 3) [m].
+    :param moments: (n - 2, 2) components of EI times the natural curvature.
+    """
+    tangents = np.diff(points, axis=0)
+    tangents = tangents / np.linalg.norm(tangents, axis=1)[:, None]
+    start = np.eye(3)[np.abs(tangents[0]).argmin()]
+    across = np.cross(tangents[0], start)
+    frames = [np.column_stack([tangents[0], across, np.cross(tangents[0], across)])
+              / [1.0, *2 * [np.linalg.norm(across)]]]
+    for one, other in zip(tangents[:-1], tangents[1:], strict=True):
+        frames.append(smallest_rotation(one, other) @ frames[-1])
+    found = np.array(frames)
+    bends = np.einsum('jik,ji->jk', found[:-1] + found[1:], np.diff(tangents, axis=0))[:, 1:]
+    angle = np.arctan2((moments[:, 0] * bends[:, 1] - moments[:, 1] * bends[:, 0]).sum(),
+                       (moments * bends).sum())
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    return np.asarray(found @ turn)
+
+
+def smallest_rotation(one: Floats, other: Floats) -> Floats:
+    """Return the (3, 3) rotation by the smallest angle that turns one unit vector, (3,), into another."""
+    axis, cosine = np.cross(one, other), float(one @ other)
+    if cosine < -1 + 1e-9:  # the DLO turns back on itself: any axis across it does
+        across = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+        across /= np.linalg.norm(across)
+        return np.asarray(2 * np.outer(across, across) - np.eye(3))
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))
+
+
+def _values(found: CalibratedDlo) -> tuple[str, ...]:
+    return tuple(
+        f'{name}, {BY_NAME[name].quantity}: {_said(found.space, name, one.value)} '
+        f'({_interval(found.space, name, one.lower, one.upper)}), {one.verdict or "verdict unknown"}'
+        for name, one in found.parameters.items())
+
+
+def _undetermined(found: CalibratedDlo) -> list[str]:
+    """Return a sentence for each parameter that the trials do not determine, with its interval."""
+    return [f'{name} is not identifiable: the trials allow '
+            f'{_interval(found.space, name, one.lower, one.upper)}; '
+            f'{_said(found.space, name, one.value)} is used'
+            for name, one in found.parameters.items() if one.verdict == NOT_IDENTIFIABLE
+            or not one.verdict and not one.identifiable]
+
+
+def _assumed(found: CalibratedDlo, physical: Mapping[str, float], chain: Chain) -> list[str]:
+    remarks = []
+    if not found.space.mass_known:
+        remarks.append(f'the mass of the DLO is unknown: {1e3 * physical["mass"]:.3g} g are assumed, and EI '
+                       'and EA hold for this mass; all three may be multiplied by the same number')
+    change = abs(chain.length - found.length) / found.length
+    if change > LENGTH_TOLERANCE:
+        remarks.append(f'the chain is {chain.length:.4g} m long, {100 * change:.0f} % from the '
+                       f'{found.length:.4g} m of the calibrated DLO: check that both are the same DLO')
+    return remarks
+
+
+def _about_table(level: float | None, radius: float, options: Options) -> list[str]:
+    if level is None or abs(level - radius - options.table_height) < LEVEL_TOLERANCE:
+        return []
+    return [f'the chain lies {measured(level - options.table_height, "m")} above the table, the radius is '
+            f'{measured(radius, "m")}: the table is at {measured(level - radius, "m")}, so that the DLO '
+            'touches it where it was seen']
+
+
+def _said(space: ParameterSpace, name: str, value: float) -> str:
+    return measured(*space.reported(name, value))
+
+
+def _interval(space: ParameterSpace, name: str, lower: float, upper: float) -> str:
+    """Return a 90 % interval for people."""
+    (one, unit), (other, _) = (space.reported(name, value) for value in (lower, upper))
+    return f'90 %: {BY_NAME[name].interval(lower, upper, (min(one, other), max(one, other)), unit)}'
