@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dlo_calibration.calibration.options import Options
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
     from dlo_calibration.evaluation.log import EvaluationLog
+    from dlo_calibration.export.mjcf import export_mjcf
     from dlo_calibration.files.result import read_result
     from dlo_calibration.files.session import read_session
     from dlo_calibration.model.action import Action, Hand
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'EvaluationLog', 'Goal', 'Hand',
-    'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'plan', 'read_result',
-    'read_session', 'simulate',
+    'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'export_mjcf', 'plan',
+    'read_result', 'read_session', 'simulate',
 ]
 
 _MODULES = {
@@ -43,6 +44,7 @@ _MODULES = {
     'planning.planner': ('plan',),
     'planning.prediction': ('simulate',),
     'evaluation.log': ('EvaluationLog',),
+    'export.mjcf': ('export_mjcf',),
     'files.session': ('read_session',),
     'files.result': ('read_result',),
     'simulation.bullet': ('BulletRope',),

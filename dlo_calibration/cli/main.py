@@ -17,6 +17,7 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import (
     capture,
     experiment,
+    export,
     fit,
     info,
     plan,
@@ -36,7 +37,7 @@ from dlo_calibration.simulation.protocol import Simulator
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
 #: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
 VERBS = {'capture': capture, 'trace': trace, 'fit': fit, 'validate': validate, 'simulate': simulate,
-         'plan': plan, 'info': info, 'plot': plot, 'experiment': experiment,
+         'plan': plan, 'export': export, 'info': info, 'plot': plot, 'experiment': experiment,
          'warm-up': warm_up}
 
 

@@ -7,6 +7,7 @@ The calibrated DLO for other simulators, as the text of a file.
 `rope` gathers in SI units what every format needs; one module writes each format.
 """
 
+from dlo_calibration.export.mjcf import export_mjcf
 from dlo_calibration.export.rope import ExportedRope
 
-__all__ = ['ExportedRope']
+__all__ = ['ExportedRope', 'export_mjcf']

@@ -15,14 +15,13 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.model.bending import natural_curvature
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
+from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, PART_NAMES
 from dlo_calibration.model.quantity import measured
 from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
 from dlo_calibration.planning.prediction import MOST_POINTS
 from dlo_calibration.simulation.nodes import feature_shares, spread_places
-from dlo_calibration.simulation.rod import RodProperties
 
 LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a remark
 LENGTH_TOLERANCE = 0.05  # of the length; a chain that differs by more may belong to another DLO
@@ -109,30 +108,33 @@ class ExportedRope:
                              'resample it to fewer points')
         physical = found.space.physical({name: one.value for name, one in found.parameters.items()},
                                         found.length)
-        rod, radius = RodProperties.of(physical), physical['self_collision']
+        radius, twisting = physical['self_collision'], physical.get('torsion', 0.0)
         level = lying_level(chain, options.table_height) if options.table else None
         chain = _without_noise(chain)
         places = spread_places(np.array([0.0, chain.length]), options.nodes)
         points = chain.resample(places)
         if level is not None:
             points = rest_on(points, level)
-        lengths = np.diff(places) * rod.length_scale
+        lengths = np.diff(places) * physical.get('length_scale', 1.0)
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
-        stiffness = rod.bending_stiffness * _relative_stiffness(ends, rod.profile)
+        stiffness = physical['flexibility'] * _relative_stiffness(ends, (
+            1.0, *(physical[name] for name in PART_NAMES if name in physical)))
         natural = natural_curvature(physical, ends[1:-1] / ends[-1])
         return cls(
             points=frozen_array(points), rest_lengths=frozen_array(lengths), radius=radius,
-            masses=frozen_array(rod.mass * lengths / ends[-1]),
-            marker_masses=frozen_array(rod.marker_mass * feature_shares(chain, places)),
-            bending_stiffness=frozen_array(stiffness), stretching_stiffness=rod.stretching_stiffness,
-            twisting_stiffness=frozen_array(rod.torsion * stiffness) if rod.torsion > 0 else None,
+            masses=frozen_array(physical['mass'] * lengths / ends[-1]),
+            marker_masses=frozen_array(physical.get('marker_mass', 0.0) * feature_shares(chain, places)),
+            bending_stiffness=frozen_array(stiffness), stretching_stiffness=physical['elasticity'],
+            twisting_stiffness=frozen_array(twisting * stiffness) if twisting > 0 else None,
             natural_curvature=frozen_array(natural),
             frames=frozen_array(_material_frames(points, stiffness[:, None] * natural)),
-            clamp_twist=rod.clamp_twist, drag=rod.drag, internal_damping=rod.internal_damping,
-            friction=physical['friction'], bending_friction=rod.bending_friction,
-            bending_slip=rod.bending_slip,
+            clamp_twist=physical.get('clamp_twist', 0.0), drag=physical['damping'],
+            internal_damping=physical['internal_damping'], friction=physical['friction'],
+            bending_friction=physical.get('bending_friction', 0.0),
+            bending_slip=physical.get('bending_slip', 0.0),
             table=None if not options.table else options.table_height if level is None else level - radius,
-            point_places=frozen_array(chain.arc_lengths() * rod.length_scale), values=_values(found),
+            point_places=frozen_array(chain.arc_lengths() * lengths.sum() / places[-1]),
+            values=_values(found),
             remarks=(*_undetermined(found), *_assumed(found, physical, chain),
                      *_about_table(level, radius, options)))
 

@@ -19,7 +19,7 @@ from importlib.resources import as_file, files
 import math
 from pathlib import Path
 import re
-from typing import Any, Iterator, Mapping
+from typing import Any, Iterator, Mapping, Sequence
 
 from lxml import etree
 import numpy as np
@@ -131,6 +131,12 @@ def add(parent: Any, tag: str, **attributes: Any) -> Any:
     """Add an element, without the attributes that are None."""
     return etree.SubElement(parent, tag, {name: text_of(value) for name, value in attributes.items()
                                           if value is not None})
+
+
+def add_comment(parent: Any, lines: Sequence[str]) -> None:
+    """Add a comment of several lines; two hyphens in a row, which XML does not allow there, become a dash."""
+    text = text_of('\n'.join(('', *(f'  {line}' for line in lines), '')))
+    parent.append(etree.Comment(re.sub('-(?=-)', '\N{EN DASH}', text)))
 
 
 def text_of(value: Any) -> str:

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `export`: writes a calibrated DLO as a file for another simulator."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Callable, Mapping
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.cli.options import add_options, given_options
+from dlo_calibration.cli.output import tell
+from dlo_calibration.errors import InputError, one_of
+from dlo_calibration.export import export_mjcf
+from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
+from dlo_calibration.files.chain_file import read_chain_file
+from dlo_calibration.files.result import read_result
+from dlo_calibration.writing import whole
+
+TEXT = 'write a calibrated DLO as a file for another simulator'
+USED = ('nodes', 'table', 'table_height')  # options
+#: Format -> what makes its text, and the names of its forms, the first one by default.
+FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {'mjcf': (export_mjcf, MJCF_FORMS)}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    forms = '; '.join(f'of {name}: {", ".join(known)}' for name, (_, known) in FORMATS.items() if known)
+    parser.add_argument('result', metavar='RESULT.xml', type=Path, help='the calibrated DLO')
+    parser.add_argument('--format', required=True, choices=tuple(FORMATS), help='mjcf: MuJoCo 3 and 4')
+    parser.add_argument('--from', dest='start', metavar='CHAIN', type=Path, required=True, help=(
+        'where the DLO lies: a CSV file with rows x,y,z [m], first point to last, or an XML document'))
+    parser.add_argument('--output', metavar='FILE', type=Path, required=True, help='the file to write')
+    parser.add_argument('--form', metavar='NAME', help=f'form of the format ({forms}; default: the first)')
+    add_options(parser, without=[one.name for one in Options.declarations() if one.name not in USED],
+                title='options of the DLO (default: those of the result)')
+
+
+def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
+    """Execute the verb; return the exit code."""
+    export, forms = FORMATS[chosen.format]
+    if chosen.form is not None and chosen.form not in forms:
+        raise InputError('--form', repr(chosen.form), one_of(forms, chosen.form) if forms else
+                         f'no form: {chosen.format} has only one', 'correct it')
+    found = read_result(chosen.result)
+    known = {name: value for name, value in found.file_options.values.items() if name in USED}
+    options = Options.of({**known, **given_options(chosen)})
+    text = export(found, read_chain_file(chosen.start), options=options,
+                  **({} if chosen.form is None else {'form': chosen.form}))
+    with whole(chosen.output) as new:
+        new.write_text(text, encoding='utf-8')
+    tell(f'the DLO is in {chosen.output}')
+    return 0

@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+MJCF: a calibrated DLO for MuJoCo 3 and 4, as a chain of capsules that ball joints connect.
+
+A ball joint has the stiffness EI / l.  Its position of rest is the rest shape of the DLO, in which the
+bodies stand; the keyframe `start` has the observed chain.  In the form `extensible`, a slide joint of
+stiffness EA / l before each ball joint lets the segment become longer.
+
+The integrator that both versions have, `implicitfast`, takes the springs of joints explicitly.  A spring of
+stiffness k needs a step below ``2 sqrt(m / k)``, which is far below a millisecond for a segment of a gram.
+So each joint has an armature of ``k h^2``: with it, every spring is stable at the step h, also in the contact
+solver, which knows no implicit damping.  An armature resists only bending and stretching, and slows a mode of
+frequency w by the share ``(w h)^2 / 2``.  The damping is the found one, but at least 0.6 h k, as in
+`simulation.rod`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError, one_of
+from dlo_calibration.export.rope import ExportedRope
+from dlo_calibration.files.xml import add, add_comment, document, new_root
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.quantity import interval, measured
+from dlo_calibration.planning.dlo import CalibratedDlo
+
+NAME = 'dlo'  # begins the names of bodies, joints, geoms and sites
+FORMS = ('extensible', 'inextensible')
+MOST_NODES = 400  # MuJoCo reads elements that are nested up to 500 deep
+TIME_STEP = 0.002  # s
+#: Friction against turning about the normal and against rolling, relative to that of sliding and the radius.
+#: The DLO is to slide, as in the calibration.  In the elliptic cone, a ratio c of rolling leaves sliding
+#: ``1 / sqrt(1 + 1 / c^2)`` of its friction.
+TURNING, ROLLING = 0.01, 10.0
+LEAST_DAMPING = 0.6  # time steps, of the damping relative to the stiffness
+
+
+def export_mjcf(found: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
+                options: Options | None = None) -> str:
+    """
+    Return a calibrated DLO at an observed chain as the text of an MJCF file.
+
+    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param form: extensible: with the found EA; inextensible: faster, for a DLO that nothing stretches.
+    :param options: see `ExportedRope.of`.
+    :raises InputError: if the form is unknown, or there are too many points or nodes.
+    """
+    rope = ExportedRope.of(found, chain, options)
+    if form not in FORMS:
+        raise InputError('form', repr(form), one_of(FORMS, form), 'correct it')
+    if len(rope.points) > MOST_NODES:
+        raise InputError('nodes', str(len(rope.points)), f'at most {MOST_NODES}, as MuJoCo reads no deeper '
+                         'nested bodies', 'take fewer nodes')
+    return document(_Writer(rope, form == 'extensible').root()).decode()
+
+
+class _Writer:
+    """
+    Makes the elements of a file.
+
+    :param stretches: whether segments can become longer.
+    """
+
+    def __init__(self, rope: ExportedRope, stretches: bool) -> None:
+        self._rope, self._stretches = rope, stretches
+        self._least = max(rope.internal_damping, LEAST_DAMPING * TIME_STEP)  # s, damping by stiffness
+
+    def root(self) -> Any:
+        """Return the root element."""
+        rope, holder = self._rope, new_root('holder')
+        root = add(holder, 'mujoco', model=NAME)
+        holder.remove(root)
+        add_comment(root, self._about())
+        add(root, 'option', timestep=TIME_STEP, integrator='implicitfast', cone='elliptic', impratio=1,
+            viscosity=_text(self._viscosity()))
+        group = add(add(root, 'default'), 'default', **{'class': NAME})
+        add(group, 'geom', type='capsule', size=_text(rope.radius), priority=1, condim=6,
+            friction=_text(rope.friction * np.array([1, TURNING * rope.radius, ROLLING * rope.radius])),
+            solref='0.004 1', rgba='0.9 0.6 0.2 1')
+        add(group, 'site', size=_text(1.1 * rope.radius), group=4)
+        world = add(root, 'worldbody')
+        add(world, 'light', pos='0 0 2', dir='0 0 -1', directional='true')
+        if rope.table is not None:
+            add(world, 'geom', name='table', type='plane', size='0 0 0.1', pos=_text([0, 0, rope.table]),
+                friction=_text([1, 0, 0]), rgba='0.5 0.5 0.5 1')
+        turns = _rest_turns(rope)
+        parent = world
+        for k in range(len(rope.rest_lengths)):
+            parent = self._segment(parent, k, turns)
+        contact = add(root, 'contact')
+        for k in range(len(rope.rest_lengths)):
+            for other in range(k + 1, min(k + 1 + self._touching(), len(rope.rest_lengths))):
+                add(contact, 'exclude', body1=f'{NAME}_{k}', body2=f'{NAME}_{other}')
+        add(add(root, 'keyframe'), 'key', name='start', qpos=_text(self._start(turns)))
+        return root
+
+    def _segment(self, parent: Any, k: int, turns: Floats) -> Any:
+        """Add the body of a segment to that of the one before, or the first to the world; return it."""
+        rope, length, mass = self._rope, float(self._rope.rest_lengths[k]), float(self._rope.masses[k])
+        across = mass * (length**2 / 12 + rope.radius**2 / 4)
+        if k == 0:
+            body = add(parent, 'body', name=f'{NAME}_0', pos=_text(rope.points[0]),
+                       quat=_text(_quaternion(rope.frames[0])), childclass=NAME)
+            add(body, 'freejoint', name=f'{NAME}_root')
+        else:
+            body = add(parent, 'body', name=f'{NAME}_{k}', pos=_text([rope.rest_lengths[k - 1], 0, 0]),
+                       quat=_text(turns[k - 1]))
+            if self._stretches:
+                stiffness = rope.stretching_stiffness / self._stretched()[k - 1]
+                along = _turned(turns[k - 1] * [1, -1, -1, -1], np.array([1.0, 0.0, 0.0]))
+                add(body, 'joint', name=f'{NAME}_stretch_{k}', type='slide', axis=_text(along),
+                    stiffness=_text(stiffness), damping=_text(stiffness * self._least),
+                    armature=_text(stiffness * TIME_STEP**2))
+            stiffness = rope.bending_stiffness[k - 1] / rope.cells[k - 1]
+            add(body, 'joint', name=f'{NAME}_bend_{k}', type='ball', stiffness=_text(stiffness),
+                damping=_text(stiffness * self._least), armature=_text(max(stiffness * TIME_STEP**2, across)))
+        add(body, 'inertial', pos=_text([length / 2, 0, 0]), mass=_text(mass),
+            diaginertia=_text([mass * rope.radius**2 / 2, across, across]))
+        add(body, 'geom', name=f'{NAME}_{k}', fromto=_text([0, 0, 0, length, 0, 0]))
+        for point, place in enumerate(rope.point_places.tolist()):
+            segment, along_it = rope.place_of(place)
+            if segment == k:
+                add(body, 'site', name=f'{NAME}_point_{point}', pos=_text([along_it, 0, 0]))
+        self._markers(body, k)
+        return body
+
+    def _markers(self, body: Any, k: int) -> None:
+        """Add the marker at the first node of a segment, and that at the last node of the last segment."""
+        rope, last = self._rope, len(self._rope.points) - 1
+        for node in (k, last) if k == last - 1 else (k,):
+            mass = float(rope.marker_masses[node])
+            if mass > 0:
+                marker = add(body, 'body', name=f'{NAME}_marker_{node}',
+                             pos=_text([0 if node == k else rope.rest_lengths[k], 0, 0]))
+                add(marker, 'inertial', pos='0 0 0', mass=_text(mass),
+                    diaginertia=_text(3 * [0.4 * mass * rope.radius**2]))
+
+    def _start(self, turns: Floats) -> Floats:
+        """Return the positions of all joints at the observed chain."""
+        rope = self._rope
+        found = [rope.points[0], _quaternion(rope.frames[0])]
+        for k, rest in enumerate(turns):
+            if self._stretches:
+                found.append(np.zeros(1))
+            found.append(_product(rest * [1, -1, -1, -1],
+                                  _quaternion(rope.frames[k].T @ rope.frames[k + 1])))
+        return np.concatenate(found)
+
+    def _stretched(self) -> Floats:
+        """Return the length [m] whose stretch each inner node has, (n - 2,); the ends' halves are added."""
+        lengths = np.array(self._rope.cells)
+        lengths[0] += self._rope.rest_lengths[0] / 2
+        lengths[-1] += self._rope.rest_lengths[-1] / 2
+        return lengths
+
+    def _touching(self) -> int:
+        """Return how many segments after each one are too near to touch it, see `simulation.rope`."""
+        return max(1, int(np.ceil(np.pi * self._rope.radius / self._rope.rest_lengths.min())))
+
+    def _viscosity(self) -> float:
+        """
+        Return the viscosity of the air [Pa s] in which a segment is slowed by the found drag.
+
+        MuJoCo's inertia box of a rod is l by sqrt(3) r by sqrt(3) r, and its drag is 3 pi times the viscosity
+        and the mean of these (MuJoCo documentation, Computation, Fluid forces, Inertia model).
+        """
+        rope = self._rope
+        size = (rope.rest_lengths[0] + 2 * np.sqrt(3) * rope.radius) / 3
+        return float(rope.drag * rope.masses[0] / (3 * np.pi * size))
+
+    def _about(self) -> list[str]:
+        """Return what a reader of the file must know."""
+        rope = self._rope
+        ends = float(rope.bending_stiffness.min()), float(rope.bending_stiffness.max())
+        bending = measured(ends[0], 'N m^2') if np.isclose(*ends) else interval(*ends, 'N m^2')
+        lines = [
+            'A calibrated DLO, written by dlo_calibration; SI units. Found parameters:', *rope.values,
+            *rope.remarks, 'Kept:',
+            f'EI of {bending} in the ball joints, the rest shape (the bodies stand in it), mass of '
+            f'{1e3 * rope.masses.sum():.3g} g, friction (also against rolling: the DLO slides), drag as '
+            'viscosity of the air; the keyframe "start" has the chain',
+            f'EA of {measured(rope.stretching_stiffness, "N")} in the slide joints' if self._stretches else
+            'the lengths: this form does not stretch',
+            'Not kept:', *self._lost(),
+            'In a world of your own, whose options hold instead of those here, take this time step or a '
+            'shorter one, the elliptic cone, and this viscosity.']
+        return lines
+
+    def _lost(self) -> list[str]:
+        """Return what MuJoCo cannot keep."""
+        rope = self._rope
+        found = 'the trials were simulated without resistance to twist' if rope.twisting_stiffness is None \
+            else f'GJ {measured(float(rope.twisting_stiffness[0]), "N m^2")} was found'
+        lines = [f'twist: ball joints resist twist as bending; {found}',
+                 f'contact between {self._touching() + 1} neighbouring segments',
+                 f'damping relative to the stiffness of {1e3 * rope.internal_damping:.3g} ms; it is '
+                 f'{1e3 * self._least:.3g} ms here']
+        if rope.bending_friction > 0:
+            lines.append(f'bends that stay: friction between strands of {rope.bending_friction:.3g} 1/m '
+                         f'times EI, which slip at {rope.bending_slip:.3g} 1/m')
+        if rope.clamp_twist:
+            lines.append(f'the angle of the second clamp, {rope.clamp_twist:.3g} rad')
+        return lines
+
+
+def _rest_turns(rope: ExportedRope) -> Floats:
+    """Return the rotation from each segment to the next in the rest shape, (n - 2, 4) quaternions w x y z."""
+    bends = rope.natural_curvature * rope.cells[:, None]
+    sizes = np.linalg.norm(bends, axis=1)
+    # The tangent turns towards the curvature: about its cross product with it.
+    axes = np.column_stack([np.zeros(len(bends)), -bends[:, 1], bends[:, 0]])
+    share = np.sinc(sizes / 2 / np.pi) / 2
+    return np.column_stack([np.cos(sizes / 2), axes * share[:, None]])
+
+
+def _quaternion(rotation: Floats) -> Floats:
+    """Return the quaternion w x y z, (4,), of a (3, 3) rotation matrix, with w >= 0."""
+    m = rotation
+    found = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+                      [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+                      [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+                      [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]]])
+    # The eigenvector of the largest eigenvalue (Bar-Itzhack, New Method for Extracting the Quaternion from a
+    # Rotation Matrix, 2000).
+    _, vectors = np.linalg.eigh(found + np.triu(found, 1).T)
+    best = vectors[:, -1]
+    return np.asarray(best if best[0] >= 0 else -best)
+
+
+def _product(one: Floats, other: Floats) -> Floats:
+    """Return the product of two quaternions w x y z."""
+    vector = one[0] * other[1:] + other[0] * one[1:] + np.cross(one[1:], other[1:])
+    return np.array([one[0] * other[0] - one[1:] @ other[1:], *vector])
+
+
+def _turned(quaternion: Floats, vector: Floats) -> Floats:
+    """Return a vector, (3,), rotated by a quaternion w x y z."""
+    twice = 2 * np.cross(quaternion[1:], vector)
+    return np.asarray(vector + quaternion[0] * twice + np.cross(quaternion[1:], twice))
+
+
+def _text(values: Any) -> str:
+    """Return numbers as text, with nine digits."""
+    return ' '.join(f'{value:.9g}' for value in np.atleast_1d(np.asarray(values, dtype=float)))

@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verb `export`: which file it writes, and what it refuses."""
+
+import pytest
+
+from dlo_calibration.cli import main as cli
+from dlo_calibration.export.mjcf import export_mjcf
+from dlo_calibration.files.chain_file import read_chain_file
+from dlo_calibration.files.result import read_result
+from dlo_calibration.files.samples import samples
+
+ROPE, START = samples() / 'xml/dlo.xml', samples() / 'chains/start.csv'
+
+
+@pytest.fixture
+def export(capsys, tmp_path):
+    """Give a function that exports the sample; it returns exit code, stderr, and the file."""
+    def export(*words, result=ROPE):
+        file = tmp_path / 'rope.out'
+        try:
+            code = cli.main(['export', str(result), '--from', str(START), '--output', str(file), *words])
+        except SystemExit as end:  # argparse
+            code = end.code
+        return code, capsys.readouterr().err, file
+
+    return export
+
+
+def test_it_writes_what_the_function_returns(export):
+    code, _, file = export('--format', 'mjcf')
+    assert code == 0
+    assert file.read_text() == export_mjcf(read_result(ROPE), read_chain_file(START))
+
+
+def test_it_takes_a_form_and_options(export):
+    code, _, file = export('--format', 'mjcf', '--form', 'inextensible', '--nodes', '11', '--no-table')
+    assert code == 0
+    text = file.read_text()
+    assert 'type="slide"' not in text and 'type="plane"' not in text
+    assert 'name="dlo_9"' in text and 'name="dlo_10"' not in text
+
+
+@pytest.mark.parametrize('words, said', [
+    (['--format', 'mjcf', '--form', 'soft'], "'soft', expected one of extensible, inextensible"),
+    (['--format', 'urdf'], 'urdf'),
+    (['--format', 'mjcf', '--nodes', '3'], 'nodes'),
+])
+def test_it_refuses_in_one_line_what_it_does_not_know(export, words, said):
+    code, error, file = export(*words)
+    assert code == 2
+    assert said in error and error.count('\n') == 1
+    assert not file.exists()
+
+
+def test_it_refuses_a_result_that_is_none(export):
+    code, error, _ = export('--format', 'mjcf', result=START)
+    assert code == 2
+    assert error.count('\n') == 1
