@@ -31,7 +31,13 @@ from dlo_calibration.cli.options import dashed, PREFIX
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
-from dlo_calibration.simulation.kernel_cache import compile_kernels, is_compiled, KERNELS, SIMULATION
+from dlo_calibration.simulation.kernel_cache import (
+    compile_kernels,
+    is_compiled,
+    KERNELS,
+    SIMULATION,
+    TOGETHER,
+)
 from dlo_calibration.simulation.protocol import Simulator
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
@@ -43,9 +49,11 @@ VERBS = {'capture': capture, 'trace': trace, 'fit': fit, 'validate': validate, '
 
 def make_told(options: Options) -> Simulator:
     """Return the simulator that `options` name; tell before its kernels are compiled, which takes long."""
-    if parent_process() is None and not is_compiled(SIMULATION):
-        tell(f'compiling the {KERNELS[SIMULATION]} for this machine, once, about half a minute')
-        compile_kernels(SIMULATION)
+    if parent_process() is None:
+        for module in (SIMULATION, TOGETHER):
+            if not is_compiled(module):
+                tell(f'compiling the {KERNELS[module]} for this machine, once, about half a minute')
+                compile_kernels(module)
     return make_chosen_simulator(options)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
 import copy
+import math
 import pickle
 import queue
 import threading
@@ -23,6 +24,9 @@ from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.memory import EvaluatorMemory, Memory
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.simulation.protocol import TogetherSimulator
+
+TOGETHER = 8  # rollouts at a time: two for each lane, so that lanes are seldom empty towards the end
 
 
 class BatchEvaluator:
@@ -58,51 +62,68 @@ class BatchEvaluator:
         if self._executor is not None:
             yield from self._in_parallel(points, first, self._executor)
             return
-        for index, point in enumerate(points, first):
-            evaluation = self._memory.find(index, point)
+        known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
+        for k, evaluation in enumerate(known):
             if evaluation is None:
+                new = [j for j in range(k, len(points)) if known[j] is None][:self._portion(len(points))]
                 try:
-                    evaluation = self.evaluator.evaluate(index, point, self._should_stop)
+                    found = self.evaluator.evaluate_all([(first + j, points[j]) for j in new],
+                                                        self._should_stop)
                 except CancelledError:
                     return
-                self._memory.add(evaluation)
+                for j, evaluation in zip(new, found, strict=True):
+                    self._memory.add(evaluation)
+                    known[j] = evaluation
             elif self._should_stop():
                 return
-            yield evaluation
+            one = known[k]
+            assert one is not None
+            yield one
+
+    def _portion(self, points: int) -> int:
+        """Return how many of so many points to evaluate at a time."""
+        if not isinstance(self.evaluator.simulator, TogetherSimulator):
+            return 1
+        wanted = math.ceil(TOGETHER / len(self.evaluator.trials))
+        return max(1, min(wanted, points // getattr(self._executor, 'workers', 1)))
 
     def _in_parallel(self, points: Floats, first: int, executor: Executor) -> Iterator[Evaluation]:
         known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
-        futures: dict[int, Future[Evaluation]] = {
-            k: executor.submit(_evaluate_in_worker, self._key, self._parcel, self.evaluator.space, first + k,
-                               points[k])
-            for k, one in enumerate(known) if one is None}
-        finished: queue.SimpleQueue[Future[Evaluation]] = queue.SimpleQueue()
-        for future in futures.values():
+        new, size = [k for k, one in enumerate(known) if one is None], self._portion(len(points))
+        futures: dict[int, tuple[Future[list[Evaluation]], int]] = {}  # and the place in its answer
+        for begin in range(0, len(new), size):
+            portion = new[begin:begin + size]
+            future = executor.submit(_evaluate_in_worker, self._key, self._parcel, self.evaluator.space,
+                                     [(first + k, points[k]) for k in portion])
+            futures.update({k: (future, place) for place, k in enumerate(portion)})
+        finished: queue.SimpleQueue[Future[list[Evaluation]]] = queue.SimpleQueue()
+        waiting = {future for future, _ in futures.values()}
+        for future in waiting:
             future.add_done_callback(finished.put)
-        waiting = set(futures.values())
         try:
             for k, evaluation in enumerate(known):
-                while futures.get(k) in waiting:
+                while k in futures and futures[k][0] in waiting:
                     if self._should_stop():
                         return
                     self._take(finished, waiting)
                 if self._should_stop():
                     return
-                yield futures[k].result() if evaluation is None else evaluation
+                yield futures[k][0].result()[futures[k][1]] if evaluation is None else evaluation
         finally:
-            for future in futures.values():
+            for future, _ in futures.values():
                 future.cancel()
 
-    def _take(self, finished: queue.SimpleQueue[Future[Evaluation]], waiting: set[Future[Evaluation]]
-              ) -> None:
-        """Wait shortly for the next evaluation in the order in which they finish, and remember it."""
+    def _take(self, finished: queue.SimpleQueue[Future[list[Evaluation]]],
+              waiting: set[Future[list[Evaluation]]]) -> None:
+        """Wait shortly for the next evaluations in the order in which they finish, and remember them."""
         try:
             future = finished.get(timeout=0.05)
         except queue.Empty:
             return
         waiting.remove(future)
         if not future.cancelled() and future.exception() is None:  # an error is raised when its turn comes
-            self._memory.add(future.result())
+            for evaluation in future.result():
+                self._memory.add(evaluation)
 
     def residuals(self, points: Floats) -> Sequence[Floats | None]:
         """
@@ -161,7 +182,7 @@ class _WorkerThread(threading.local):
 _worker_thread = _WorkerThread()
 
 
-def _evaluate_in_worker(key: str, parcel: _Parcel, space: ParameterSpace, index: int, point: Floats
-                        ) -> Evaluation:
-    """Evaluate a point of a space in a worker, which keeps the evaluator of the trials."""
-    return _worker_thread.of(key, parcel).of(space).evaluate(index, point)
+def _evaluate_in_worker(key: str, parcel: _Parcel, space: ParameterSpace,
+                        points: Sequence[tuple[int, Floats]]) -> list[Evaluation]:
+    """Evaluate points of a space, each with its index, in a worker that keeps the evaluator of the trials."""
+    return _worker_thread.of(key, parcel).of(space).evaluate_all(points)

@@ -13,7 +13,14 @@ from typing import Callable, Iterator
 
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.processes import ProcessExecutor
-from dlo_calibration.simulation.kernel_cache import compile_kernels, is_compiled, KERNELS, remark, SIMULATION
+from dlo_calibration.simulation.kernel_cache import (
+    compile_kernels,
+    is_compiled,
+    KERNELS,
+    remark,
+    SIMULATION,
+    TOGETHER,
+)
 
 PERIOD = 0.05  # s between two looks whether to wait no longer
 
@@ -22,7 +29,8 @@ class Compiling:
     """
     Has kernels compiled where this machine has not yet compiled them.
 
-    What an interrupted compilation has compiled is kept: Numba writes one kernel after the other.
+    What an interrupted compilation has compiled is kept: Numba writes one kernel after the other.  The
+    kernels for several trials at once come after those of the simulation, and nobody waits for them.
 
     :param module: of the kernels.
     :param then: called when they are compiled, in the thread that waited for that, e.g. to load them.
@@ -71,31 +79,38 @@ class Compiling:
     def _work(self) -> None:
         try:
             if not is_compiled(self._module):
-                self._compile()
+                self.under_way = _words(self._module)
+                self._compile(self._module)
             if not self._closed:
                 self._then()
         except Exception:  # whoever uses the engine meets the same error, and tells it
-            pass
+            return
         finally:
             self.under_way = ''
             self._ended.set()
+        with suppress(Exception):  # the simulation does without, but takes longer
+            if self._module == SIMULATION and not is_compiled(TOGETHER):
+                self._compile(TOGETHER)
 
-    def _compile(self) -> None:
+    def _compile(self, module: str) -> None:
         begun = time.monotonic()
         with self._lock:
             if self._closed:
                 return
             self._executor = ProcessExecutor(1)
-        self.under_way = f'compiling the {KERNELS[self._module]} for this machine, once, about half a minute'
-        for text in filter(None, [self.under_way, remark()]):
+        for text in filter(None, [_words(module), remark()]):
             self._news.put(text)
         try:
-            self._executor.submit(compile_kernels, self._module).result()
-            self._news.put(f'the {KERNELS[self._module]} is compiled, after {time.monotonic() - begun:.0f} s')
+            self._executor.submit(compile_kernels, module).result()
+            self._news.put(f'the {KERNELS[module]} is compiled, after {time.monotonic() - begun:.0f} s')
         except Exception as error:
             if not self._closed:
-                self._news.put(f'the {KERNELS[self._module]} could not be compiled: {error}')
+                self._news.put(f'the {KERNELS[module]} could not be compiled: {error}')
             raise
         finally:
             with suppress(RuntimeError):
                 self._executor.close()
+
+
+def _words(module: str) -> str:
+    return f'compiling the {KERNELS[module]} for this machine, once, about half a minute'

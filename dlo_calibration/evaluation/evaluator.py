@@ -8,7 +8,8 @@ from __future__ import annotations
 from concurrent.futures import CancelledError
 import copy
 from dataclasses import replace
-from typing import Callable, Mapping, Sequence
+from itertools import islice
+from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, TrialScore
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import advanced, Rollout, Simulator
+from dlo_calibration.simulation.protocol import Rollout, simulate_all, Simulator
 
 
 def mean_length(trials: Sequence[Trial]) -> float:
@@ -76,18 +77,35 @@ class Evaluator:
 
         :raises CancelledError: if `should_stop` is True before a trial.
         """
-        point = frozen_array(point)
-        evaluation = Evaluation(index, point, self.space.values(point))
-        physical = self.space.physical(evaluation.values, self._length)
-        rollouts: list[Rollout] = []
-        for trial in self.trials:
+        return self.evaluate_all([(index, point)], should_stop)[0]
+
+    def evaluate_all(self, points: Sequence[tuple[int, Floats]],
+                     should_stop: Callable[[], bool] = lambda: False) -> list[Evaluation]:
+        """
+        Try points of the unit cube, each with its index; to some simulators, several at a time are less work.
+
+        :raises CancelledError: if `should_stop` is True before a trial.
+        """
+        def between() -> None:
             if should_stop():
                 raise CancelledError
-            try:
-                rollouts.append(self.simulator.simulate(trial, physical))
-                advanced()
-            except SimulationError as error:
-                return replace(evaluation, failure=str(error), skipped=len(self.trials) - len(rollouts) - 1)
+
+        begun = [Evaluation(index, frozen_array(point), self.space.values(point)) for index, point in points]
+        jobs = [[(trial, physical) for trial in self.trials]
+                for physical in (self.space.physical(one.values, self._length) for one in begun)]
+        if len(begun) == 1:  # a failure ends it
+            return [self._evaluated(begun[0], simulate_all(self.simulator, jobs[0], between))]
+        rollouts = simulate_all(self.simulator, [job for one in jobs for job in one], between)
+        return [self._evaluated(one, list(islice(rollouts, len(self.trials)))) for one in begun]
+
+    def _evaluated(self, evaluation: Evaluation, found: Iterable[Rollout | SimulationError]) -> Evaluation:
+        """Return an evaluation with what its rollouts tell."""
+        rollouts: list[Rollout] = []
+        for rollout in found:
+            if isinstance(rollout, SimulationError):
+                return replace(evaluation, failure=str(rollout),
+                               skipped=len(self.trials) - len(rollouts) - 1)
+            rollouts.append(rollout)
         evaluation = replace(
             evaluation, scores=tuple(float(score(rollout.chains))
                                      for score, rollout in zip(self._scores, rollouts, strict=True)),

@@ -69,8 +69,10 @@ class ProcessExecutor(Executor):
         # At exit, Python would send SIGTERM, which the processes ignore, and wait for them for ever.
         atexit.register(self.close)
         first = []
+        #: number of processes
+        self.workers = workers or cores()
         try:
-            for _ in range(workers or cores()):
+            for _ in range(self.workers):
                 first.append(self._new_process())
         except BaseException:
             self._kill()

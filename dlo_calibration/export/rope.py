@@ -11,7 +11,6 @@ from typing import Mapping
 import numpy as np
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import InputError
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
 from dlo_calibration.model.bending import natural_curvature
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
@@ -20,7 +19,6 @@ from dlo_calibration.model.quantity import measured
 from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
-from dlo_calibration.planning.prediction import MOST_POINTS
 from dlo_calibration.simulation.nodes import feature_shares, spread_places
 
 LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a remark
@@ -100,12 +98,8 @@ class ExportedRope:
 
         :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
         :param options: `nodes`, `table` and `table_height` are used; None: the defaults.
-        :raises InputError: if the chain has too many points.
         """
         options = options or Options()
-        if len(chain) > MOST_POINTS:
-            raise InputError('export', f'a chain of {len(chain)} points', f'at most {MOST_POINTS}',
-                             'resample it to fewer points')
         physical = found.space.physical({name: one.value for name, one in found.parameters.items()},
                                         found.length)
         radius, twisting = physical['self_collision'], physical.get('torsion', 0.0)

@@ -10,15 +10,21 @@ It is faster because no call into another library is needed for each node and st
 
 from __future__ import annotations
 
-from typing import Mapping
+from functools import partial
+from typing import Callable, Hashable, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import GRAVITY
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.engine import Engine
+from dlo_calibration.simulation.kernel_cache import is_compiled, TOGETHER
 from dlo_calibration.simulation.nodes import NodeLayout
+from dlo_calibration.simulation.protocol import Job, Rollout
+from dlo_calibration.simulation.rollout import Course, course
 from dlo_calibration.simulation.rope import diverged, Rope
 
 
@@ -35,7 +41,22 @@ class CompiledRope(Rope):
         super().__init__(places, points, velocities, physical, time_step, np.array([0.0, 0.0, -GRAVITY]),
                          features, directions)
         self.time_step = time_step
-        self._level = -1e6 if level is None else level  # so low that nothing touches it
+        self.level = -1e6 if level is None else level  # so low that nothing touches it
+
+    @property
+    def kind(self) -> Hashable:
+        """What ropes have in common that can be stepped together."""
+        rod = self.state.rod
+        frame, rows = rod.frame, rod.friction.rows
+        return (len(self.state.points), rod.step, len(frame.angles), len(frame.twisting), len(rows),
+                frame.clamped.tobytes(), self.state.gravity.tobytes())
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether its first step, which sets up the state of frame and friction, has been taken."""
+        frame, friction = self.state.rod.frame, self.state.rod.friction
+        return bool((frame.begun[0] or not len(frame.angles)) and (
+            friction.begun[0] or not len(friction.rows)))
 
     def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
         """
@@ -46,7 +67,7 @@ class CompiledRope(Rope):
         path = np.empty((0, 0, 3)) if path is None else path
         turns = np.empty((0, 0, 9)) if turns is None else np.ascontiguousarray(turns)
         targets = np.ascontiguousarray(targets)
-        if kernels.advance(self.state, targets, turns, self._level, path) < len(targets):
+        if kernels.advance(self.state, targets, turns, self.level, path) < len(targets):
             raise diverged()
 
 
@@ -54,6 +75,34 @@ class CompiledSimulator(Engine):
     """Simulates trials on a table or in the air, 20 to 30 times as fast as `bullet.BulletSimulator`."""
 
     name = 'compiled'
+
+    def simulate_together(self, jobs: Sequence[Job],
+                          between: Callable[[], None] = lambda: None) -> list[Rollout | SimulationError]:
+        """
+        Simulate each job; see `TogetherSimulator`.
+
+        :raises InputError: if a trial grips more points than there are nodes.
+        """
+        if not is_compiled(TOGETHER):  # it may be under way
+            found = []
+            for job in jobs:
+                between()
+                found.append(self._outcome(*job))
+            return found
+        from dlo_calibration.simulation.together import roll_out_together
+
+        def start(trial: Trial, physical: Mapping[str, float]) -> tuple[CompiledRope, Course]:
+            layout, rope = self._start(trial, physical)
+            assert isinstance(rope, CompiledRope)
+            return rope, course(trial, layout, rope, self._settling)
+
+        return roll_out_together([partial(start, *job) for job in jobs], between)
+
+    def _outcome(self, trial: Trial, physical: Mapping[str, float]) -> Rollout | SimulationError:
+        try:
+            return self.simulate(trial, physical)
+        except SimulationError as error:
+            return error
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> CompiledRope:

@@ -43,7 +43,7 @@ class Engine:
         self._nodes = nodes
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
-        self._known: dict[int, tuple[Trial, NodeLayout, float | None]] = {}
+        self._known: dict[int, tuple[Trial, NodeLayout, float | None, Floats]] = {}
 
     def prepare(self) -> None:
         """Do nothing: importing the kernels has compiled them or loaded them from the cache."""
@@ -55,21 +55,30 @@ class Engine:
         :raises SimulationError: if the rollout diverges.
         :raises InputError: if the trial grips more points than there are nodes.
         """
-        layout, level = self._layout(trial)
-        points = layout.points
-        if self._table_height is not None:
-            if level is None:
-                level = self._table_height + physical['self_collision']
-            points = rest_on(points, level)
-        return roll_out(trial, layout, self._rope(layout, points, physical, level), self._settling)
+        layout, rope = self._start(trial, physical)
+        return roll_out(trial, layout, rope, self._settling)
 
-    def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None]:
-        """Return the nodes of a trial and the height [m] of nodes on the table; None: unknown or no table."""
+    def _start(self, trial: Trial, physical: Mapping[str, float]) -> tuple[NodeLayout, Stepper]:
+        """Return the nodes of a trial, and a rope at the start of it."""
+        layout, level, points = self._layout(trial)
+        if self._table_height is not None and level is None:
+            level = self._table_height + physical['self_collision']
+            points = rest_on(points, level)
+        return layout, self._rope(layout, points, physical, level)
+
+    def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None, Floats]:
+        """
+        Return the nodes of a trial, the height [m] of nodes on the table, and (N, 3) [m] where nodes start.
+
+        The height is None if it is unknown, or if there is no table.
+        """
         if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
             while len(self._known) >= MOST_KNOWN:
                 self._known.pop(next(iter(self._known)))
             level = None if self._table_height is None else resting_level(trial, self._table_height)
-            self._known[id(trial)] = trial, NodeLayout.of(trial, self._nodes), level
+            layout = NodeLayout.of(trial, self._nodes)
+            points = layout.points if level is None else rest_on(layout.points, level)
+            self._known[id(trial)] = trial, layout, level, points
         return self._known[id(trial)][1:]
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],

@@ -12,6 +12,7 @@ write.
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import lru_cache
 import hashlib
 import importlib
 from importlib.metadata import PackageNotFoundError, version
@@ -26,9 +27,13 @@ import tempfile
 CHOSEN = 'NUMBA_CACHE_DIR'  # the environment variable that tells Numba where
 _PACKAGE = Path(os.path.abspath(__file__)).parents[1]
 #: module with kernels -> what they do, in words
-KERNELS: dict[str, str] = {'dlo_calibration.simulation.kernels': 'simulation',
-                           'dlo_calibration.capture.path': 'tracer'}
-SIMULATION, TRACER = KERNELS
+KERNELS: dict[str, str] = {
+    'dlo_calibration.simulation.kernels': 'simulation',
+    'dlo_calibration.simulation.kernels_together': 'simulation of several trials at once',
+    'dlo_calibration.capture.path': 'tracer'}
+SIMULATION, TOGETHER, TRACER = KERNELS
+#: name of a module with kernels -> other files that its machine code depends on
+_SOURCES = {'kernels': ('lanes.py',), 'kernels_together': ('kernels.py', 'lanes.py')}
 
 
 def settle(folder: Path) -> None:
@@ -66,9 +71,18 @@ def is_compiled(module: str) -> bool:
 
 def compile_kernels(module: str) -> None:
     """Import a module, which compiles its kernels or loads them, and note that they are compiled."""
+    folder, mark = place(module), _mark(_file(module))
+    begun = (folder / mark).with_suffix('.begun')
+    with suppress(OSError):
+        if not (folder / mark).exists() and not begun.exists():
+            # Numba does not notice that another module has changed; after an interruption it may go on.
+            for old in folder.glob(f'{_file(module).stem}.*.nb[ic]'):
+                old.unlink()
+            folder.mkdir(parents=True, exist_ok=True)
+            begun.touch()
     importlib.import_module(module)
     with suppress(OSError):
-        (place(module) / _mark(_file(module))).touch()
+        (folder / mark).touch()
 
 
 def remark() -> str:
@@ -116,7 +130,15 @@ def _until_the_next_boot(make: bool = True) -> Path:
 
 def _mark(file: Path) -> str:
     """Return the name of the file that tells that a module's kernels, as they are now, were compiled here."""
-    found = hashlib.sha256(file.read_bytes())
+    sources = [file, *(file.with_name(name) for name in _SOURCES.get(file.stem, ()))]
+    return _mark_of(file.stem, tuple((one, one.stat().st_mtime_ns) for one in sources if one.exists()))
+
+
+@lru_cache(maxsize=16)
+def _mark_of(stem: str, sources: tuple[tuple[Path, int], ...]) -> str:
+    found = hashlib.sha256()
+    for source, _ in sources:
+        found.update(source.read_bytes())
     for name in ('numba', 'llvmlite'):
         with suppress(PackageNotFoundError):
             found.update(version(name).encode())
@@ -125,4 +147,4 @@ def _mark(file: Path) -> str:
         lines = Path('/proc/cpuinfo').read_text(encoding='utf-8', errors='replace').splitlines()
         found.update('\n'.join(dict.fromkeys(
             one for one in lines if one.startswith(('model name', 'flags', 'Features')))).encode())
-    return f'{file.stem}.{found.hexdigest()[:16]}.compiled'
+    return f'{stem}.{found.hexdigest()[:16]}.compiled'

@@ -16,10 +16,22 @@ import math
 from typing import Any, Callable, NamedTuple, TypeVar
 
 import numba
+from numba.extending import overload
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation.lanes import (
+    both,
+    cosine_and_sine,
+    COUNT,
+    every,
+    finite,
+    LANES,
+    numbers_of,
+    some,
+    where,
+)
 
 Kernel = TypeVar('Kernel', bound=Callable[..., Any])
 
@@ -52,13 +64,15 @@ FASTEST_PUSH_OUT = 0.8  # m/s; limits that correction, so that it does not throw
 SUPPORTED = 0.5  # cosine between a push and the opposing support from which on the node is supported
 UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
 WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
-SKIN = 0.008  # m; pairs within this gap are checked until nodes may have moved this far
+SKIN = 0.0001, 0.008  # m, least and most; pairs within this gap are checked until nodes may have moved so far
+STEPS_AHEAD = 10.0  # between these, the gap is as wide as nodes move in so many steps
+BESIDE = 3  # segments; pairs that are not further from each other along the DLO
 FAST = 0.001  # m; where nodes move further in a step, it is first asked whether all are clear of each other
 
 BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
 
 
-def _record(record: Any) -> Any:
+def record(record: Any) -> Any:
     """Let kernels take a named tuple; its annotations give the types of its fields."""
     make: Any = numba.types.NamedTuple
     TYPES[record.__name__] = make([TYPES[word.__forward_arg__] for word in record.__annotations__.values()],
@@ -66,7 +80,7 @@ def _record(record: Any) -> Any:
     return record
 
 
-def _part(kernel: Kernel) -> Kernel:
+def part(kernel: Kernel) -> Kernel:
     """Compile a function together with the kernels that call it."""
     options: dict[str, Any] = {'_nrt': False}  # parts make no arrays: references to them need not be counted
     compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
@@ -79,7 +93,16 @@ def _inlined(kernel: Kernel) -> Kernel:
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-def _compiled(kernel: Kernel) -> Kernel:
+def _one_or_each(function: Callable[..., Any]) -> Callable[[Kernel], Kernel]:
+    """Compile `function` as what the decorated one returns for the types: for one DLO, or for each lane."""
+    def register(choose: Kernel) -> Kernel:
+        overload(function, strict=False, inline='never', jit_options={
+            'nogil': True, 'error_model': 'numpy', '_nrt': False})(choose)
+        return choose
+    return register
+
+
+def entry(kernel: Kernel) -> Kernel:
     """Compile a kernel at import, or load it from the cache: a rollout never waits for the compiler."""
     *arguments, returned = (TYPES[word] for word in kernel.__annotations__.values())
     compile_: Any = numba.njit(returned(*arguments), cache=True, nogil=True, error_model='numpy')
@@ -100,7 +123,7 @@ CONTACT = np.dtype([
 TYPES['Contacts'] = numba.from_dtype(CONTACT)[::1]
 
 
-@_record
+@record
 class FrameState(NamedTuple):
     """
     The material frame of N - 1 segments, which carries the rest shape and resists twist; see `rod`.
@@ -135,7 +158,7 @@ class FrameState(NamedTuple):
     turning: Matrix
 
 
-@_record
+@record
 class SlipState(NamedTuple):
     """
     Friction between the strands of a DLO: an elastic, perfectly plastic element at each inner node.
@@ -156,7 +179,7 @@ class SlipState(NamedTuple):
     pull: Matrix
 
 
-@_record
+@record
 class RodState(NamedTuple):
     """
     All that determines the internal forces of N nodes; `rod.Rod` makes it.
@@ -193,7 +216,7 @@ class RodState(NamedTuple):
     right: Vector
 
 
-@_record
+@record
 class SelfContact(NamedTuple):
     """
     Contact of S segments with each other: capsules that do not pass through each other.
@@ -212,7 +235,8 @@ class SelfContact(NamedTuple):
     :param distances: (S, S) [m] least distances of the pairs.
     :param pairs: (S (S - 1) / 2, 2) segments; the first `near` of these pairs are near each other.
     :param near: (1,) number of these pairs.
-    :param room: (1,) [m] how far nodes may move until pairs must be searched again; negative: search now.
+    :param room: (2,) [m] how far nodes may move until pairs must be searched again, negative: search now; and
+        until pairs that are further than `BESIDE` along the DLO must be.
     :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
     :param change: (S + 1, 3) workspace.
     :param motion: (14, S) workspace.
@@ -236,7 +260,7 @@ class SelfContact(NamedTuple):
     next_one: int
 
 
-@_record
+@record
 class RopeState(NamedTuple):
     """
     The state of a DLO between two steps; `rope.Rope` makes it.
@@ -259,7 +283,7 @@ class RopeState(NamedTuple):
     contact: SelfContact
 
 
-@_part
+@part
 def _solve(bands: Matrix, right: Vector) -> bool:
     """
     Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
@@ -271,9 +295,12 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     size = len(right) - BAND + 1
     for j in range(size):
         pivot = bands[j, 0]
-        if not pivot > 0.0:
-            return False
         inverse = 1.0 / pivot
+        positive: bool = pivot > 0.0
+        if not every(positive):
+            if not some(positive):
+                return positive
+            inverse = where(positive, inverse, math.nan)
         for k in range(1, BAND):
             factor = bands[j, k] * inverse
             for i in range(BAND - k):
@@ -289,10 +316,11 @@ def _solve(bands: Matrix, right: Vector) -> bool:
             value -= bands[j, k] * right[j + k]
         right[j] = value
         total += value
-    return math.isfinite(total)
+    solved: bool = finite(total)
+    return solved
 
 
-@_part
+@part
 def _transport(frame: Vector, before: Vector, tangent: Vector) -> None:
     """Transport `frame` (3,) from the tangent `before` (3,) to another by the smallest rotation, in place."""
     cosine = before[0] * tangent[0] + before[1] * tangent[1] + before[2] * tangent[2]
@@ -308,7 +336,7 @@ def _transport(frame: Vector, before: Vector, tangent: Vector) -> None:
         frame[c] /= size
 
 
-@_part
+@part
 def _perpendicular(tangent: Vector, frame: Vector) -> None:
     """Write to `frame` (3,) a unit vector perpendicular to a (3,) tangent."""
     least = 0
@@ -320,9 +348,8 @@ def _perpendicular(tangent: Vector, frame: Vector) -> None:
     frame[least], frame[one], frame[two] = 0.0, tangent[two] / size, -tangent[one] / size
 
 
-@_part
-def _begin_to_carry(segments: Matrix, carried: Matrix, begun: bool) -> None:
-    """Carry the first vector of the reference frame from where it was in the last step."""
+@part
+def _begin_to_carry_one(segments: Matrix, carried: Matrix, begun: bool) -> None:
     for c in range(3):
         carried[2, c] = segments[0, c]
     if begun:
@@ -331,6 +358,22 @@ def _begin_to_carry(segments: Matrix, carried: Matrix, begun: bool) -> None:
         _perpendicular(carried[2], carried[1])
     for c in range(3):
         carried[0, c], segments[0, 4 + c] = carried[2, c], carried[1, c]
+
+
+def _begin_to_carry(segments: Matrix, carried: Matrix, begun: bool) -> None:
+    """Carry the first vector of the reference frame from where it was in the last step."""
+    raise NotImplementedError('kernels alone use this')
+
+
+@_one_or_each(_begin_to_carry)
+def _begin_to_carry_in(segments: Matrix, carried: Matrix, begun: bool) -> Any:
+    if segments.dtype != LANES:
+        return lambda segments, carried, begun: _begin_to_carry_one(segments, carried, begun)
+
+    def each(segments: Matrix, carried: Matrix, begun: bool) -> None:
+        for lane in range(COUNT):
+            _begin_to_carry_one(numbers_of(segments)[:, :, lane], numbers_of(carried)[:, :, lane], begun)
+    return each
 
 
 @_inlined
@@ -345,24 +388,25 @@ def _carry_along(segments: Matrix, joints: Matrix, i: int) -> tuple[float, float
     u0, u1, u2 = segments[i, 4], segments[i, 5], segments[i, 6]
     square = (1.0 + a0 * b0 + a1 * b1 + a2 * b2) / 2
     hairpin = square < HAIRPIN
-    if hairpin:
-        square = HAIRPIN
+    if some(hairpin):
+        square = where(hairpin, HAIRPIN, square)
     inverse = 1.0 / math.sqrt(square)
     x = (b0 * u0 + b1 * u1 + b2 * u2) * inverse
     y = (u0 * (a2 * b1 - a1 * b2) + u1 * (a0 * b2 - a2 * b0) + u2 * (a1 * b0 - a0 * b1)) * inverse
     joints[i, 0], joints[i, 1], joints[i, 2], joints[i, 6] = x, y, inverse, inverse * square
     share = x * (inverse / 2)
     u0, u1, u2 = u0 - share * (a0 + b0), u1 - share * (a1 + b1), u2 - share * (a2 + b2)
-    if hairpin:  # that was not quite a rotation
+    if some(hairpin):  # that was not quite a rotation
         left = u0 * b0 + u1 * b1 + u2 * b2
-        u0, u1, u2 = u0 - left * b0, u1 - left * b1, u2 - left * b2
-        left = 1.0 / math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
-        u0, u1, u2 = left * u0, left * u1, left * u2
+        v0, v1, v2 = u0 - left * b0, u1 - left * b1, u2 - left * b2
+        left = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        u0, u1 = where(hairpin, left * v0, u0), where(hairpin, left * v1, u1)
+        u2 = where(hairpin, left * v2, u2)
     segments[i + 1, 4], segments[i + 1, 5], segments[i + 1, 6] = u0, u1, u2
     return x, y
 
 
-@_part
+@part
 def _angle_of(segments: Matrix, segment: int, direction: Vector, near: float) -> float:
     """Return the angle [rad] of a (3,) direction across a segment, in the turn that is next to `near`."""
     t0, t1, t2 = segments[segment, 0], segments[segment, 1], segments[segment, 2]
@@ -373,7 +417,7 @@ def _angle_of(segments: Matrix, segment: int, direction: Vector, near: float) ->
     return angle + 2 * math.pi * round((near - angle) / (2 * math.pi))
 
 
-@_part
+@part
 def _mean_direction(natural: Matrix, joints: Matrix) -> tuple[float, float]:
     """Return the bends [N m] in the directions of the natural curvature and across: sums over all joints."""
     one, two = 0.0, 0.0
@@ -383,7 +427,7 @@ def _mean_direction(natural: Matrix, joints: Matrix) -> tuple[float, float]:
     return one, two
 
 
-@_part
+@part
 def _turn_freely(natural: Matrix, joints: Matrix) -> None:
     """
     Turn the frame as a whole to the least energy, and find the twisting moments.
@@ -395,7 +439,8 @@ def _turn_freely(natural: Matrix, joints: Matrix) -> None:
     total = 0.0
     for i in range(len(natural)):
         total += natural[i, 2]
-    size = math.sqrt(one**2 + two**2 + (ROUNDED * total / len(natural))**2)
+    least = ROUNDED * total / len(natural)
+    size = math.sqrt(one * one + two * two + least * least)
     cosine, sine = one / size, two / size
     twist, slope = 0.0, 0.0
     for i in range(len(natural)):
@@ -406,8 +451,8 @@ def _turn_freely(natural: Matrix, joints: Matrix) -> None:
         joints[i, 3], joints[i, 4], joints[i, 5] = cosine, sine, twist
 
 
-@_part
-def _first_angles(frame: FrameState) -> None:
+@part
+def _first_angles_of_one(frame: FrameState) -> None:
     """Set the angles at the start: between clamps of known direction evenly twisted, else without twist."""
     angles, clamped, clamps, segments = frame.angles, frame.clamped, frame.clamps, frame.segments
     joints = frame.joints
@@ -432,9 +477,8 @@ def _first_angles(frame: FrameState) -> None:
         joints[i, 3], joints[i, 4] = math.cos(phi), math.sin(phi)
 
 
-@_part
-def _turn_of_clamp(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> float:
-    """Return how far [rad] segment `j` must turn in clamp `s`; one that just closed keeps what it finds."""
+@part
+def _find_turn_of_one(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> None:
     t0, t1, t2 = segments[j, 0], segments[j, 1], segments[j, 2]
     u0, u1, u2 = segments[j, 4], segments[j, 5], segments[j, 6]
     v0, v1, v2 = t1 * u2 - t2 * u1, t2 * u0 - t0 * u2, t0 * u1 - t1 * u0
@@ -449,11 +493,28 @@ def _turn_of_clamp(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: 
     clamps[s, 0], clamps[s, 1], clamps[s, 2] = d0, d1, d2
     clamps[s, 3], clamps[s, 4], clamps[s, 5] = t0, t1, t2
     turn: float = math.atan2(d0 * v0 + d1 * v1 + d2 * v2, d0 * u0 + d1 * u1 + d2 * u2) - angles[j]
-    return turn - 2 * math.pi * round(turn / (2 * math.pi))
+    clamps[s, 6] = turn - 2 * math.pi * round(turn / (2 * math.pi))
 
 
-@_part
-def _turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> None:
+def _find_turn(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> None:
+    """Find how far [rad] segment `j` must turn in clamp `s`; one that just closed keeps what it finds."""
+    raise NotImplementedError('kernels alone use this')
+
+
+@_one_or_each(_find_turn)
+def _find_turn_in(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> Any:
+    if segments.dtype != LANES:
+        return lambda segments, angles, clamps, s, j: _find_turn_of_one(segments, angles, clamps, s, j)
+
+    def each(segments: Matrix, angles: Vector, clamps: Matrix, s: int, j: int) -> None:
+        for lane in range(COUNT):
+            _find_turn_of_one(numbers_of(segments)[:, :, lane], numbers_of(angles)[:, lane],
+                              numbers_of(clamps)[:, :, lane], s, j)
+    return each
+
+
+@part
+def turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> None:
     """
     Turn the clamps with their hands.
 
@@ -470,7 +531,7 @@ def _turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> None:
                 clamps[s, k + c] = turns[h, 3 * c] * x + turns[h, 3 * c + 1] * y + turns[h, 3 * c + 2] * z
 
 
-@_part
+@part
 def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped: IndexRows, clamps: Matrix,
                      segments: Matrix, joints: Matrix, turning: Matrix, begun: bool) -> None:
     """
@@ -502,12 +563,13 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
             diagonal += next_diagonal
             right += torque - slope
         beside = twisting[max(i - 1, 0)]
-        if diagonal < 1e-6 * beside:
-            diagonal = beside
+        weak = diagonal < 1e-6 * beside
+        if some(weak):
+            diagonal = where(weak, beside, diagonal)
         upper = coupling
         if s < len(clamped) and clamped[s, 0] == i:
-            if begun or math.isfinite(clamps[s, 0]):
-                clamps[s, 6] = _turn_of_clamp(segments, angles, clamps, s, i)
+            if begun or every(finite(clamps[s, 0])):
+                _find_turn(segments, angles, clamps, s, i)
                 diagonal, right, upper = 1.0, clamps[s, 6], 0.0
             s += 1
         inverse = 1.0 / diagonal
@@ -517,12 +579,13 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
     for i in range(n - 2, -1, -1):
         turning[i, 0] -= turning[i, 1] * turning[i + 1, 0]
         largest = max(largest, abs(turning[i, 0] + turning[i + 1, 0]))
-    if largest > 2 * REACH:
-        share = 2 * REACH / largest
+    far = largest > 2 * REACH
+    if some(far):
+        share = where(far, 2 * REACH / largest, 1.0)
         for i in range(n):
             turning[i, 0] *= share
         for s in range(len(clamped)):
-            if begun or math.isfinite(clamps[s, 0]):
+            if begun or every(finite(clamps[s, 0])):
                 turning[clamped[s, 0], 0] = clamps[s, 6]
     angles[0] += turning[0, 0]
     for i in range(n - 1):
@@ -535,28 +598,47 @@ def _balance_torques(natural: Matrix, twisting: Vector, angles: Vector, clamped:
 @_inlined
 def _turned(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     """Return cosine and sine of an angle [rad] that has grown by `angle`."""
-    if abs(angle) < 0.01:
-        q = angle * angle
-        c, s = 1 - q * (0.5 - q * (1 / 24)), angle * (1 - q * (1 / 6 - q * (1 / 120)))
-    else:
-        c, s = math.cos(angle), math.sin(angle)
+    q = angle * angle
+    c, s = 1 - q * (0.5 - q * (1 / 24)), angle * (1 - q * (1 / 6 - q * (1 / 120)))
+    large = abs(angle) > 0.01
+    if some(large):
+        exact_c, exact_s = cosine_and_sine(angle)
+        c, s = where(large, exact_c, c), where(large, exact_s, s)
     x, y = cosine * c - sine * s, sine * c + cosine * s
     left = 1.5 - (x * x + y * y) / 2  # so that rounding does not add up
     return left * x, left * y
 
 
-@_part
-def add_frame(frame: FrameState, turns: Matrix, step: float, right: Vector) -> None:
+@part
+def _begin_frame_of_one(frame: FrameState) -> None:
+    _first_angles_of_one(frame)
+    for _ in range(FIRST_TURNS):
+        _balance_torques(frame.natural, frame.twisting, frame.angles, frame.clamped, frame.clamps,
+                         frame.segments, frame.joints, frame.turning, False)
+
+
+def _begin_frame(frame: FrameState) -> None:
+    """Find the angles at the start."""
+    raise NotImplementedError('kernels alone use this')
+
+
+@_one_or_each(_begin_frame)
+def _begin_frame_in(frame: Any) -> Any:
+    if frame.types[0].dtype != LANES:
+        return lambda frame: _begin_frame_of_one(frame)
+    return lambda frame: None  # several DLOs go on together from their second step on
+
+
+@part
+def add_frame(frame: FrameState, step: float, right: Vector) -> None:
     """
     Add to `right` (3 N,) the impulses [N s] of natural curvature and twist; see `rod`.
 
     The forces are the exact gradient of the energy, for segments that move without turning about their axes.
     A segment has no inertia about its axis, so that a couple of forces at its ends replaces the torque on it.
-
-    :param turns: see `_turn_clamps`.
     """
     natural, twisting, angles, begun = frame.natural, frame.twisting, frame.angles, frame.begun
-    segments, joints, clamped, clamps = frame.segments, frame.joints, frame.clamped, frame.clamps
+    segments, joints = frame.segments, frame.joints
     _begin_to_carry(segments, frame.carried, begun[0] == 1)
     if len(twisting) == 0:
         for i in range(len(joints)):
@@ -564,12 +646,9 @@ def add_frame(frame: FrameState, turns: Matrix, step: float, right: Vector) -> N
         _turn_freely(natural, joints)
     else:
         if begun[0] == 0:
-            _first_angles(frame)
-            for _ in range(FIRST_TURNS):
-                _balance_torques(natural, twisting, angles, clamped, clamps, segments, joints, frame.turning,
-                                 False)
-        _balance_torques(natural, twisting, angles, clamped, clamps, segments, joints, frame.turning, True)
-        _turn_clamps(clamped, clamps, turns)
+            _begin_frame(frame)
+        _balance_torques(natural, twisting, angles, frame.clamped, frame.clamps, segments, joints,
+                         frame.turning, True)
     begun[0] = 1
     g0, g1, g2 = 0.0, 0.0, 0.0  # torque [N m] on the segment, turned by a right angle
     for i in range(len(joints) + 1):
@@ -600,7 +679,7 @@ def add_frame(frame: FrameState, turns: Matrix, step: float, right: Vector) -> N
         g0, g1, g2 = h0, h1, h2
 
 
-@_part
+@part
 def rub(friction: SlipState, points: Matrix, step: float) -> None:
     """
     Write to `friction.pull` what friction between strands adds to the equations of the nodes; see `rod`.
@@ -667,8 +746,9 @@ def _limited(x: float, y: float, z: float, most: float) -> float:
     """Return by how much a vector must be multiplied so that it is not longer than `most`."""
     square = x * x + y * y + z * z
     share = 1.0
-    if square > most * most:
-        share = most / math.sqrt(square)
+    longer = square > most * most
+    if some(longer):
+        share = where(longer, most / math.sqrt(square), share)
     return share
 
 
@@ -677,18 +757,67 @@ def _inverse(square: float) -> float:
     """Return 1 / square, the squared length of the sum of two unit vectors, which are mostly parallel."""
     away = 1.0 - square / 4
     inverse = (1.0 + away * (1.0 + away * (1.0 + away))) / 4
-    if away > 1e-4:
-        inverse = 1.0 / max(square, 4 * HAIRPIN)
+    far = away > 1e-4
+    if some(far):
+        inverse = where(far, 1.0 / max(square, 4 * HAIRPIN), inverse)
     return inverse
 
 
-@_part
-def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Matrix,
-                   predicted: Matrix) -> bool:
+@part
+def _hold_one(bands: Matrix, right: Vector, masses: Vector, held: Indices, follow: Matrix) -> None:
+    for h in range(len(held)):
+        pull = HELD * masses[held[h]]
+        for c in range(3):
+            j = 3 * held[h] + c
+            bands[j, 0] += pull
+            right[j] += pull * follow[h, c]
+
+
+def _hold(bands: Matrix, right: Vector, masses: Vector, held: Indices, follow: Matrix) -> None:
+    """Let held nodes follow the velocities that their hands give them."""
+    raise NotImplementedError('kernels alone use this')
+
+
+@_one_or_each(_hold)
+def _hold_in(bands: Matrix, right: Vector, masses: Vector, held: Indices, follow: Matrix) -> Any:
+    if bands.dtype != LANES:
+        return lambda bands, right, masses, held, follow: _hold_one(bands, right, masses, held, follow)
+
+    def each(bands: Matrix, right: Vector, masses: Vector, held: Any, follow: Any) -> None:
+        for lane in range(COUNT):
+            _hold_one(numbers_of(bands)[:, :, lane], numbers_of(right)[:, lane], numbers_of(masses)[:, lane],
+                      held[lane], follow[lane])
+    return each
+
+
+@part
+def _let_follow_one(predicted: Matrix, held: Indices, follow: Matrix) -> None:
+    for h in range(len(held)):
+        for c in range(3):
+            predicted[held[h], c] = follow[h, c]
+
+
+def let_follow(predicted: Matrix, held: Indices, follow: Matrix) -> None:
+    """Give held nodes exactly the velocities of their hands."""
+    raise NotImplementedError('kernels alone use this')
+
+
+@_one_or_each(let_follow)
+def _let_follow_in(predicted: Matrix, held: Indices, follow: Matrix) -> Any:
+    if predicted.dtype != LANES:
+        return lambda predicted, held, follow: _let_follow_one(predicted, held, follow)
+
+    def each(predicted: Matrix, held: Any, follow: Any) -> None:
+        for lane in range(COUNT):
+            _let_follow_one(numbers_of(predicted)[:, :, lane], held[lane], follow[lane])
+    return each
+
+
+@part
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> bool:
     """
     Write to `predicted` the (N, 3) velocities [m/s] after a step of the internal forces; see `rod`.
 
-    :param turns: see `_turn_clamps`.
     :returns: False if the rollout diverges.
     """
     rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
@@ -700,8 +829,10 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Mat
     rubs, pull = len(rod.friction.rows) > 0, rod.friction.pull
     if rubs:
         rub(rod.friction, points, step)
-    right[size:] = 0.0
-    bands[size:] = 0.0
+    for j in range(size, size + BAND - 1):
+        right[j] = 0.0
+        for k in range(BAND):
+            bands[j, k] = 0.0
     for i in range(n):
         diagonal = masses[i] * (1.0 + drag * step) + implicit * bending[0, i]
         first, second = implicit * bending[1, i], implicit * bending[2, i]
@@ -770,25 +901,17 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, turns: Mat
         bands[j + 2, 2] -= yz
         bands[j + 2, 3] -= zz
     if framed:
-        add_frame(rod.frame, turns, step, right)
-    for h in range(len(held)):
-        pull = HELD * masses[held[h]]
-        for c in range(3):
-            j = 3 * held[h] + c
-            bands[j, 0] += pull
-            right[j] += pull * follow[h, c]
-    if not _solve(bands, right):
-        return False
+        add_frame(rod.frame, step, right)
+    _hold(bands, right, masses, held, follow)
+    solved = _solve(bands, right)
     for i in range(n):
         for c in range(3):
             predicted[i, c] = right[3 * i + c]
-    for h in range(len(held)):
-        for c in range(3):
-            predicted[held[h], c] = follow[h, c]
-    return True
+    let_follow(predicted, held, follow)
+    return solved
 
 
-@_part
+@part
 def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
     """
     Return the closest points of two segments (Ericson, Real-Time Collision Detection, 5.1.9).
@@ -823,7 +946,7 @@ def _closest(points: Matrix, first: int, second: int) -> tuple[float, ...]:
     return s, clipped, 0.0, 0.0, 1.0, distance
 
 
-@_part
+@part
 def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
     """
     Write to `contact.pairs` the pairs of segments that can touch and whose gap is below `reach` [m].
@@ -861,7 +984,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
     return count
 
 
-@_compiled
+@entry
 def start_distances(contact: SelfContact, points: Matrix) -> None:
     """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
     distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
@@ -871,10 +994,10 @@ def start_distances(contact: SelfContact, points: Matrix) -> None:
         i, j = pairs[k, 0], pairs[k, 1]
         distances[i, j] = min(diameter, _closest(points, i, j)[5])
         contact.overlaps[0] = 1
-    contact.room[0] = -1.0
+    contact.room[:] = -1.0
 
 
-@_part
+@part
 def _find_contacts(capsules: SelfContact, near: int, points: Matrix, velocities: Matrix, step: float) -> int:
     """Write those of the first `near` pairs that would come too near within a step; return their number."""
     distances, diameter = capsules.distances, capsules.diameter
@@ -903,7 +1026,7 @@ def _find_contacts(capsules: SelfContact, near: int, points: Matrix, velocities:
     return count
 
 
-@_part
+@part
 def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Matrix, change: Matrix) -> None:
     """
     Find out which nodes of the first `count` contacts yield, and how much.
@@ -943,7 +1066,7 @@ def _prepare(contacts: Contacts, count: int, inverse_masses: Vector, support: Ma
             contact.rubbed[c] = 0.0
 
 
-@_part
+@part
 def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Matrix, change: Matrix) -> None:
     """Make one iteration of the solver over the first `count` contacts, with Coulomb friction."""
     change[:] = 0.0
@@ -974,7 +1097,7 @@ def _push_apart(contacts: Contacts, count: int, friction: float, velocities: Mat
     velocities += change
 
 
-@_part
+@part
 def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities: Matrix) -> None:
     """Let the nodes that did not yield pass the impulses on to the bodies that support them."""
     for k in range(count):
@@ -986,8 +1109,8 @@ def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities:
                 velocities[at, c] += passed_on * (contact.pushed * contact.normal[c] + contact.rubbed[c])
 
 
-@_part
-def _travel(velocities: Matrix, step: float) -> float:
+@part
+def travel(velocities: Matrix, step: float) -> float:
     """Return an upper bound [m] of how far two nodes approach each other in a step."""
     n = len(velocities)
     mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
@@ -1003,19 +1126,13 @@ def _travel(velocities: Matrix, step: float) -> float:
     return 2 * step * math.sqrt(fastest)
 
 
-@_part
-def may_touch(velocities: Matrix, step: float, room: Vector, near: Indices) -> bool:
-    """Tell whether any pair may be near; `room` and `near` are those of `SelfContact`."""
-    room[0] -= _travel(velocities, step)
-    return bool(room[0] < 0 or near[0] > 0)
-
-
-@_part
-def _are_clear(balls: Matrix, count: int, first: int, last: int) -> bool:
+@part
+def _are_clear(balls: Matrix, count: int, first: int, last: int, skin: float) -> bool:
     """
-    Tell whether balls do not meet in a step, each with those that are `first` to `last` further.
+    Tell whether balls stay apart in a step, each from those that are `first` to `last` further.
 
     :param balls: (7, n) [m] centres, motion of the centres in the step, and radii; the first `count` columns.
+    :param skin: [m] gap that is left between them.
     """
     x, y, z, u, v, w, radius = balls[0], balls[1], balls[2], balls[3], balls[4], balls[5], balls[6]
     for away in range(first, min(last + 1, count)):
@@ -1026,21 +1143,21 @@ def _are_clear(balls: Matrix, count: int, first: int, last: int) -> bool:
         for i in range(count - away):
             a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
             d, e, f = u_there[i] - u[i], v_there[i] - v[i], w_there[i] - w[i]
-            both = radius_there[i] + radius[i]
+            radii = radius_there[i] + radius[i] + skin
             # (p + q)^2 <= 1.2 p^2 + 6 q^2
-            met += not a * a + b * b + c * c > 1.2 * both * both + 6.0 * (d * d + e * e + f * f)
+            met += not a * a + b * b + c * c > 1.2 * radii * radii + 6.0 * (d * d + e * e + f * f)
         if met > 0:
             return False
     return True
 
 
-@_part
-def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step: float) -> bool:
+@part
+def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step: float, way: float) -> bool:
     """
-    Tell whether surely no two segments touch each other within a step; see `keep_apart`.
+    Tell whether surely no two segments touch each other within a step; see `is_near`.
 
     All pairs are checked, which takes less time than a search that branches: near ones by balls around
-    segments, the others by balls around two segments.
+    segments, the others by balls around two segments, if possible for the following steps, too.
     """
     diameter, segments, next_one = contact.diameter, len(contact.half), contact.next_one
     single, double = contact.motion[:7], contact.motion[7:]
@@ -1052,22 +1169,51 @@ def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step:
             length += (points[i + 1, c] - points[i, c])**2
             change += (velocities[i + 1, c] - velocities[i, c])**2
         single[6, i] = (diameter + math.sqrt(length) + step * math.sqrt(change)) / 2
-    if not _are_clear(single, segments, next_one, 3):
+    if not _are_clear(single, segments, next_one, BESIDE, 0.0):
         return False
+    if contact.room[1] >= 0:
+        return True
     count = (segments + 1) // 2
     for k in range(count):
         i = 2 * k + 1
         for c in range(3):
             double[c, k], double[3 + c, k] = points[i, c], step * velocities[i, c]
         double[6, k] = 2 * max(single[6, i - 1], single[6, min(i, segments - 1)]) - diameter / 2
-    return _are_clear(double, count, max(2, next_one // 2), count)
+    first, skin = max(2, next_one // 2), STEPS_AHEAD * way
+    if _are_clear(double, count, first, count, skin):
+        contact.room[1] = skin
+        return True
+    return _are_clear(double, count, first, count, 0.0)
 
 
-@_part
+@part
+def is_near(contact: SelfContact, points: Matrix, velocities: Matrix, step: float, way: float) -> bool:
+    """
+    Tell whether the DLO may touch itself in a step, and find the pairs of segments that are near.
+
+    :param way: [m] of `travel`.
+    """
+    near, room = contact.near, contact.room
+    room[0] -= way
+    room[1] -= way
+    if room[0] < 0:
+        if way > FAST and _stays_clear(contact, points, velocities, step, way):
+            near[0] = 0
+            if contact.overlaps[0] == 1:
+                contact.distances[:] = contact.diameter
+                contact.overlaps[0] = 0
+            return False
+        skin = min(max(SKIN[0], STEPS_AHEAD * way), SKIN[1])
+        near[0] = near_pairs(contact, points, 1.2, way + skin)  # a segment may be stretched by 20 %
+        room[0] = skin
+    return bool(near[0] > 0)
+
+
+@part
 def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector,
                support: Matrix, step: float) -> None:
     """
-    Correct `velocities` so that segments do not pass through each other; call it if they `may_touch`.
+    Correct `velocities` so that segments do not pass through each other; call it where the DLO `is_near`.
 
     Contacts are velocity constraints, solved by Jacobi iterations with mass splitting (Tonge et al., Mass
     Splitting for Jitter-Free Parallel Rigid Body Simulation, 2012).
@@ -1078,18 +1224,7 @@ def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse
     :param support: (N, 3) [m/s] change of the velocities by other bodies in the last step.
     :param step: time step [s].
     """
-    near = contact.near
-    if contact.room[0] < 0:
-        way = _travel(velocities, step)
-        if way > FAST and _stays_clear(contact, points, velocities, step):
-            near[0] = 0
-            if contact.overlaps[0] == 1:
-                contact.distances[:] = contact.diameter
-                contact.overlaps[0] = 0
-            return
-        near[0] = near_pairs(contact, points, 1.2, way + SKIN)  # a segment may be stretched by 20 %
-        contact.room[0] = SKIN
-    count = _find_contacts(contact, near[0], points, velocities, step)
+    count = _find_contacts(contact, contact.near[0], points, velocities, step)
     if count == 0:
         return
     contacts, change = contact.contacts, contact.change
@@ -1099,7 +1234,7 @@ def keep_apart(contact: SelfContact, points: Matrix, velocities: Matrix, inverse
     _pass_on(contacts, count, inverse_masses, velocities)
 
 
-@_part
+@part
 def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: float, step: float) -> None:
     """
     Correct `velocities` for contact with a table, with Coulomb friction.
@@ -1112,21 +1247,20 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
     margin = 0.02 * math.sqrt(3.0) * 0.005  # m; a sphere of 5 mm that is further away is not in contact
     for i in range(len(points)):
         distance = points[i, 2] - level
-        if distance > margin:
-            continue
         depth = -(distance + slop)
-        least = 0.08 * depth / step if depth > 0 else depth / step  # one step corrects 8 %
+        least = where(depth > 0.0, 0.08 * depth / step, depth / step)  # one step corrects 8 %
         push = least - velocities[i, 2]
-        if push <= 0:
-            continue
-        velocities[i, 2] = least
-        speed = math.hypot(velocities[i, 0], velocities[i, 1])
-        share = 1.0 - min(1.0, friction * push / speed) if speed > 0 else 0.0
-        velocities[i, 0] *= share
-        velocities[i, 1] *= share
+        touches = both(distance < margin, push > 0.0)
+        if some(touches):
+            vx, vy = velocities[i, 0], velocities[i, 1]
+            speed = math.sqrt(vx * vx + vy * vy)
+            share = where(speed > 0.0, 1.0 - min(1.0, friction * push / speed), 0.0)
+            velocities[i, 0] = where(touches, share * vx, vx)
+            velocities[i, 1] = where(touches, share * vy, vy)
+            velocities[i, 2] = where(touches, least, velocities[i, 2])
 
 
-@_part
+@part
 def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Matrix, held: Indices,
                 follow: Matrix, step: float) -> None:
     """Add gravity to the velocities; write those of the held nodes to `follow`."""
@@ -1138,32 +1272,33 @@ def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Ma
             velocities[i, c] += step * gravity[c]
 
 
-@_compiled
+@entry
 def predict_velocities(rope: RopeState, targets: Matrix, turns: Matrix) -> bool:
     """
     Write to `rope.predicted` the velocities due to gravity, internal forces and self-contact.
 
     :param targets: (h, 3) [m] positions of the held nodes after the step.
-    :param turns: see `_turn_clamps`.
+    :param turns: see `turn_clamps`.
     :returns: False if the rollout diverges.
     """
     rod, contact = rope.rod, rope.contact
     points, velocities, predicted = rope.points, rope.velocities, rope.predicted
     _start_step(points, velocities, rope.gravity, targets, rod.held, rod.follow, rod.step)
-    if not rod_velocities(rod, points, velocities, turns, predicted):
+    if not rod_velocities(rod, points, velocities, predicted):
         return False
-    if may_touch(predicted, rod.step, contact.room, contact.near):
+    turn_clamps(rod.frame.clamped, rod.frame.clamps, turns)
+    if is_near(contact, points, predicted, rod.step, travel(predicted, rod.step)):
         keep_apart(contact, points, predicted, rod.inverse_masses, rope.support, rod.step)
     return True
 
 
-@_compiled
+@entry
 def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cube) -> int:
     """
     Take k steps on a table.
 
     :param targets: (k, h, 3) [m] positions of the held nodes after each step.
-    :param turns: (k, h, 9) of `_turn_clamps` in each step, or (0, 0, 0).
+    :param turns: (k, h, 9) of `turn_clamps` in each step, or (0, 0, 0).
     :param level: height of nodes that touch the table [m].
     :param path: (k, N, 3) [m] where the positions of all nodes after each step are written; or empty.
     :returns: number of steps taken, below k if the rollout diverged.
@@ -1171,13 +1306,13 @@ def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cub
     rod, contact, gravity, inverse_masses = rope.rod, rope.contact, rope.gravity, rope.rod.inverse_masses
     points, velocities, predicted, support = rope.points, rope.velocities, rope.predicted, rope.support
     held, follow, step, friction = rod.held, rod.follow, rod.step, contact.friction
-    room, near = contact.room, contact.near
-    free = np.empty((0, 0))
     for k in range(len(targets)):
         _start_step(points, velocities, gravity, targets[k], held, follow, step)
-        if not rod_velocities(rod, points, velocities, turns[k] if len(turns) > 0 else free, predicted):
+        if not rod_velocities(rod, points, velocities, predicted):
             return k
-        if may_touch(predicted, step, room, near):
+        if len(turns) > 0:
+            turn_clamps(rod.frame.clamped, rod.frame.clamps, turns[k])
+        if is_near(contact, points, predicted, step, travel(predicted, step)):
             keep_apart(contact, points, predicted, inverse_masses, support, step)
         for i in range(len(points)):
             for c in range(3):

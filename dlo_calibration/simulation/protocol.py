@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Mapping, Protocol
+from typing import Callable, Iterator, Mapping, Protocol, runtime_checkable, Sequence
 
 import numpy as np
 
@@ -56,6 +56,9 @@ class Rollout:
         object.__setattr__(self, 'chains', chains)
 
 
+Job = tuple[Trial, Mapping[str, float]]  # a trial, and physical parameters by name (SI units)
+
+
 class Simulator(Protocol):
     """
     Simulates trials; the same call gives the same rollout, bit for bit.
@@ -86,3 +89,34 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Free the resources of the simulator; it may be used again afterwards."""
+
+
+@runtime_checkable
+class TogetherSimulator(Protocol):
+    """A simulator to which several rollouts at a time are less work."""
+
+    def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None]
+                          ) -> list[Rollout | SimulationError]:
+        """
+        Simulate each job; the rollouts are those of `Simulator.simulate`.
+
+        :param between: is called again and again; what it raises ends the simulation.
+        :returns: the rollouts, or why they failed, in order.
+        """
+
+
+def simulate_all(simulator: Simulator, jobs: Sequence[Job], between: Callable[[], None]
+                 ) -> Iterator[Rollout | SimulationError]:
+    """Yield the rollout of each job, or why it failed; together if the simulator can."""
+    if isinstance(simulator, TogetherSimulator) and len(jobs) > 1:
+        yield from simulator.simulate_together(jobs, between)
+        return
+    for trial, physical in jobs:
+        between()
+        try:
+            rollout = simulator.simulate(trial, physical)
+        except SimulationError as error:
+            yield error
+        else:
+            advanced()
+            yield rollout

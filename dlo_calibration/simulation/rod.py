@@ -132,7 +132,8 @@ class Rod:
         masses = properties.mass * weights / weights.sum()
         if features is not None:
             masses += properties.marker_mass * features
-        self._properties = properties
+        self._properties, self._holds = properties, False
+        self._rows = _curvature_rows(rest_lengths)
         self.state = RodState(
             rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
             masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), frame=_no_frame(),
@@ -155,7 +156,11 @@ class Rod:
         """
         state = self.state
         held = np.array(nodes, np.int64)
-        follows = np.isin(np.arange(len(state.masses)), held)
+        if self._holds and np.array_equal(held, state.held):
+            return
+        self._holds = True
+        follows = np.zeros(len(state.masses), bool)
+        follows[held] = True
         rigid = follows[:-1] & follows[1:]
         stiffnesses = self._stiffnesses(rigid)
         bendable = np.where(rigid, 0.0, state.rest_lengths)
@@ -166,7 +171,7 @@ class Rod:
             frame=self._frame(rigid, stiffnesses, cells, held, directions or {}),
             friction=self._friction(joints, cells),
             inverse_masses=np.where(follows, 0.0, 1 / state.masses),
-            bending=_bending_bands(_curvature_rows(state.rest_lengths), joints))
+            bending=_bending_bands(self._rows, joints))
 
     def _frame(self, rigid: NDArray[np.bool_], stiffnesses: Floats, cells: Floats, held: NDArray[np.int64],
                directions: Mapping[int, Floats]) -> FrameState:
@@ -176,7 +181,7 @@ class Rod:
         clamped = np.flatnonzero(rigid) if twists else np.zeros(0, np.int64)
         curved = bool(properties.natural_curvature) or bool(np.any(properties.rest_curvature))
         if not (curved or len(clamped)) or rigid.all():
-            return _no_frame()
+            return _no_frame() if len(before.angles) else before
         n = len(rigid)
         inner = np.cumsum(self.state.rest_lengths)[:-1] / self.state.rest_lengths.sum()
         curvature = np.zeros((n - 1, 2))
@@ -208,8 +213,7 @@ class Rod:
         if not properties.bending_friction > 0:
             return before
         slip = properties.bending_slip
-        rows = np.column_stack([_curvature_rows(self.state.rest_lengths),
-                                joints * (properties.bending_friction / slip), cells * slip])
+        rows = np.column_stack([self._rows, joints * (properties.bending_friction / slip), cells * slip])
         if not len(before.rows):
             before = before._replace(kept=np.zeros((len(cells), 9)), pull=np.zeros((len(cells) + 2, 6)))
         return before._replace(rows=rows)

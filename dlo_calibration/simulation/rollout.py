@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import cycle
 import math
-from typing import Iterator, Protocol, Sequence
+from typing import Generator, Iterator, Protocol, Sequence, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.action import Hand
@@ -48,6 +49,42 @@ class Settling:
     distance: float = 0.0005
     time: float = 0.25
     limit: float = 10.0
+
+
+@dataclass(frozen=True)
+class Steps:
+    """
+    What a trial asks of a stepper next.
+
+    :param targets: (k, h, 3) [m] positions of the held nodes after each step; after k steps, they stay.
+    :param turns: (k, h, 9) rotation matrices of their hands in each step, row by row; None: it makes no
+        difference how they turn.
+    :param count: number of steps; with `settling`, the most.
+    :param path: (count, N, 3) [m] where the nodes' positions after each step are written; None: nowhere.
+    :param settling: the steps end as soon as the DLO is stable; None: they do not.
+    """
+
+    targets: Floats
+    turns: Floats | None
+    count: int
+    path: Floats | None = None
+    settling: Settling | None = None
+
+    def periods(self, time_step: float) -> NDArray[np.int64]:
+        """Return the steps between checks whether the DLO is stable, (CHECKS,), again and again; or (0,)."""
+        if self.settling is None:
+            return np.zeros(0, np.int64)
+        return _periods(max(CHECKS, round(self.settling.time / time_step)))
+
+
+@lru_cache(maxsize=16)
+def _periods(window: int) -> NDArray[np.int64]:
+    bounds = np.linspace(0, window, CHECKS + 1).astype(np.int64)
+    return bounds[1:] - bounds[:-1]
+
+
+#: the course of a trial: yields steps, is sent how many were taken and whether the DLO is stable, and returns
+Course = Generator[Steps, tuple[int, bool] | None, Rollout]
 
 
 class Stepper(Protocol):
@@ -83,7 +120,56 @@ def roll_out(trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settl
 
     :raises SimulationError: if the rollout diverges.
     """
+    steps_of, taken = course(trial, layout, stepper, settling), None
+    try:
+        while True:
+            taken = take(stepper, steps_of.send(taken))
+    except StopIteration as end:
+        rollout: Rollout = end.value
+        return rollout
+
+
+def course(trial: Trial, layout: NodeLayout, stepper: Stepper, settling: Settling) -> Course:
+    """Return the course of a trial for a stepper that is at the start of it; others take its steps."""
     return _Course(trial, layout, stepper, settling).rollout()
+
+
+def take(stepper: Stepper, steps: Steps) -> tuple[int, bool]:
+    """
+    Let a stepper take steps.
+
+    :returns: how many it took, and whether the DLO is stable.
+    :raises SimulationError: if the rollout diverges.
+    """
+    taken = 0
+
+    def advance(count: int) -> None:
+        nonlocal taken
+        now = np.arange(taken, taken + count)
+        stepper.advance(
+            steps.targets[np.minimum(now, len(steps.targets) - 1)],
+            None if steps.path is None else steps.path[taken:taken + count],
+            None if steps.turns is None else steps.turns[np.minimum(now, len(steps.turns) - 1)])
+        advanced()
+        taken += count
+
+    if steps.settling is None:
+        while taken < steps.count:
+            advance(min(PIECE, steps.count - taken))
+        return taken, False
+    seen: deque[Floats] = deque([stepper.points], maxlen=CHECKS + 1)  # over one window
+    for count in cycle(steps.periods(stepper.time_step).tolist()):
+        advance(min(count, steps.count - taken))
+        seen.append(stepper.points)
+        if len(seen) > CHECKS and _largest_move(seen) < steps.settling.distance:
+            return taken, True
+        if taken == steps.count:
+            break
+    return taken, False
+
+
+Answer = TypeVar('Answer')
+Asking = Generator[Steps, tuple[int, bool] | None, Answer]
 
 
 @dataclass
@@ -111,22 +197,23 @@ class _Course:
         self._waiting = sorted(trial.hands, key=lambda hand: hand.start)
         self._hold()
 
-    def rollout(self) -> Rollout:
-        """Simulate up to each goal in turn."""
+    def rollout(self) -> Course:
+        """Go up to each goal in turn."""
         chains, settled = [], []
         traced: dict[int, Floats] = {}
         for k, goal in enumerate(self._trial.goals):
             self._goal = k
             if goal.stable:
-                self._act_until(goal.time)
+                yield from self._act_until(goal.time)
                 self._open(goal)
                 now = self._time
-                settled.append(self._settle(self._settling.limit))
+                settled.append((yield from self._settle(self._settling.limit)))
                 self._time = now  # settling takes no time of the trial
                 chains.append(self._observed(self._stepper.points))
             else:
                 if k not in traced:
-                    traced = {k: self._observed(self._points_at(goal.time)), **self._trace(k + 1)}
+                    points = yield from self._points_at(goal.time)
+                    traced = {k: self._observed(points), **(yield from self._trace(k + 1))}
                 chains.append(traced[k])
                 settled.append(True)
         return Rollout(np.array(chains), tuple(settled), self._steps * self._stepper.time_step, self._steps)
@@ -140,20 +227,21 @@ class _Course:
         observed: Floats = self._layout.observe @ points
         return observed
 
-    def _points_at(self, instant: float) -> Floats:
+    def _points_at(self, instant: float) -> Asking[Floats]:
         """Return the points at an instant, interpolated between two steps."""
         step = self._stepper.time_step
-        self._act_until(instant - step)
+        yield from self._act_until(instant - step)
         before, start = self._last
         while self._time < instant - ROUNDING:
             before, start = self._last = self._stepper.points, self._time
             self._close()
-            self._advance(1)
+            yield from self._advance(1)
             self._open_arrived()
         share = (instant - start) / (self._time - start) if self._time > start else 0.0
-        return before + min(max(share, 0.0), 1.0) * (self._stepper.points - before)
+        points: Floats = before + min(max(share, 0.0), 1.0) * (self._stepper.points - before)
+        return points
 
-    def _trace(self, first: int) -> dict[int, Floats]:
+    def _trace(self, first: int) -> Asking[dict[int, Floats]]:
         """
         Return the observed points at the timed goals from the index `first` to the next event of a hand.
 
@@ -178,7 +266,7 @@ class _Course:
         path = np.empty((count + 2, *self._last[0].shape))
         path[:2] = self._last[0], self._stepper.points
         times = np.concatenate([[self._last[1]], self._time + step * np.arange(count + 1)])
-        self._advance(count, path[2:])
+        yield from self._advance(count, path[2:])
         self._last = path[-2], float(times[-2])
         instants = np.array([goal.time for goal in self._trial.goals[first:last]])
         after = np.clip(np.searchsorted(times, instants - ROUNDING), 1, len(times) - 1)
@@ -187,7 +275,7 @@ class _Course:
         points = path[after - 1] + shares[:, None, None] * (path[after] - path[after - 1])
         return dict(zip(range(first, last), self._layout.observe @ points, strict=True))
 
-    def _act_until(self, until: float) -> None:
+    def _act_until(self, until: float) -> Asking[None]:
         """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
         while self._time < until - ROUNDING:
             self._close()
@@ -195,9 +283,10 @@ class _Course:
             starts = [hand.start for hand in self._waiting if hand.start < until]
             target = min([*ends, *starts, until])
             if ends or not self._nothing_timed_before(target):
-                self._advance(max(1, math.ceil((target - self._time) / self._stepper.time_step - 1e-6)))
+                yield from self._advance(
+                    max(1, math.ceil((target - self._time) / self._stepper.time_step - 1e-6)))
             else:
-                self._settle(min(target - self._time, self._settling.limit))
+                yield from self._settle(min(target - self._time, self._settling.limit))
                 self._time = max(self._time, target)
             self._open_arrived()
 
@@ -258,42 +347,34 @@ class _Course:
         self._rests = False
         self._stepper.hold(tuple(node for grip in self._grips.values() for node in grip.nodes))
 
-    def _advance(self, count: int, path: Floats | None = None) -> None:
-        grips = self._grips.values()
-        after = [np.arange(count) + self._steps - grip.closed for grip in grips]
-        targets = [grip.path[np.minimum(k, len(grip.path) - 1)] for k, grip in zip(after, grips, strict=True)]
-        steps = np.concatenate(targets, axis=1) if targets else np.zeros((count, 0, 3))
-        turns = None if not self._stepper.twists else np.concatenate(
-            [np.repeat(grip.turns[np.minimum(k, len(grip.turns) - 1), None], len(grip.nodes), axis=1)
-             for k, grip in zip(after, grips, strict=True)], axis=1)
-        for begin in range(0, count, PIECE):
-            piece = slice(begin, begin + PIECE)
-            self._stepper.advance(steps[piece], None if path is None else path[piece],
-                                  None if turns is None else turns[piece])
-            advanced()
-        self._time += count * self._stepper.time_step
-        self._steps += count
-        self._rests = False
+    def _advance(self, count: int, path: Floats | None = None) -> Asking[None]:
+        yield from self._ask(count, path, None)
 
-    def _settle(self, limit: float) -> bool:
+    def _settle(self, limit: float) -> Asking[bool]:
         """Simulate until the DLO is stable, at most for a limit [s]; tell whether it is stable then."""
-        if self._rests:
-            return True
-        step = self._stepper.time_step
-        window = max(CHECKS, round(self._settling.time / step))
-        parts = np.diff(np.linspace(0, window, CHECKS + 1).astype(int))
-        left = round(limit / step)
-        seen: deque[Floats] = deque([self._stepper.points], maxlen=CHECKS + 1)  # over one window
-        for count in cycle(parts):
-            self._advance(int(min(count, left)))
-            left -= int(min(count, left))
-            seen.append(self._stepper.points)
-            if len(seen) > CHECKS and _largest_move(seen) < self._settling.distance:
-                self._rests = True
-                return True
-            if left == 0:
-                break
-        return False
+        if not self._rests:
+            self._rests = yield from self._ask(round(limit / self._stepper.time_step), None, self._settling)
+        return self._rests
+
+    def _ask(self, count: int, path: Floats | None, settling: Settling | None) -> Asking[bool]:
+        """Ask for steps; tell whether the DLO is stable after them."""
+        grips = self._grips.values()
+        after = [self._steps - grip.closed for grip in grips]
+        moving = max((len(grip.turns) - k for k, grip in zip(after, grips, strict=True)), default=1)
+        now = np.arange(min(max(moving, 1), count))
+        targets = [grip.path[np.minimum(now + k, len(grip.path) - 1)]
+                   for k, grip in zip(after, grips, strict=True)]
+        turns = None if not self._stepper.twists else np.concatenate(
+            [np.repeat(grip.turns[np.minimum(now + k, len(grip.turns) - 1), None], len(grip.nodes), axis=1)
+             for k, grip in zip(after, grips, strict=True)], axis=1)
+        answer = yield Steps(
+            np.concatenate(targets, axis=1) if targets else np.zeros((1, 0, 3)), turns, count, path, settling)
+        assert answer is not None
+        taken, stable = answer
+        self._time += taken * self._stepper.time_step
+        self._steps += taken
+        self._rests = False
+        return stable
 
 
 def _largest_move(seen: Sequence[Floats]) -> float:

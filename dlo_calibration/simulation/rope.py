@@ -97,7 +97,7 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
     return kernels.SelfContact(
         half=half, middles=middles, diameter=2.0 * radius, apart=apart, friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
-        near=np.zeros(1, np.int64), room=np.full(1, -1.0),
+        near=np.zeros(1, np.int64), room=np.full(2, -1.0),
         contacts=np.empty(count, kernels.CONTACT),
         change=np.empty((segments + 1, 3)), motion=np.empty((14, segments)),
         overlaps=np.zeros(1, np.int64), next_one=int(beyond.min(initial=segments)))

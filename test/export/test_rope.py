@@ -8,7 +8,7 @@ from calibrated import LENGTH, LEVEL, MadeUpDlo, straight
 import numpy as np
 import pytest
 
-from dlo_calibration import Chain, InputError, Options, read_result
+from dlo_calibration import Chain, Options, read_result
 from dlo_calibration.export import ExportedRope
 from dlo_calibration.files.samples import samples
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
@@ -90,11 +90,6 @@ def test_an_unknown_mass_is_said():
 
 def test_a_chain_of_another_dlo_is_doubted():
     assert any('same DLO' in remark for remark in ExportedRope.of(MadeUpDlo(), straight(length=0.9)).remarks)
-
-
-def test_too_many_points_are_refused():
-    with pytest.raises(InputError, match='2001 points.*at most 2000'):
-        ExportedRope.of(MadeUpDlo(), straight(2001))
 
 
 def test_the_level_is_that_of_the_table():

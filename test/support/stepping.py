@@ -21,7 +21,8 @@ class SteppedRod(Rod):
         self.state.follow[:] = held_velocities
         wanted = np.empty_like(points)
         pushed = velocities + self.state.step * gravity
-        assert kernels.rod_velocities(self.state, points, pushed, turns, wanted)
+        assert kernels.rod_velocities(self.state, points, pushed, wanted)
+        kernels.turn_clamps(self.state.frame.clamped, self.state.frame.clamps, turns)
         return wanted
 
     def frame_forces(self, points, times=1):
@@ -30,7 +31,7 @@ class SteppedRod(Rod):
             self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.state.held), 3)))
         impulses = np.zeros(points.size)
         if len(self.state.frame.angles):
-            kernels.add_frame(self.state.frame, NO_TURNS, 1.0, impulses)
+            kernels.add_frame(self.state.frame, 1.0, impulses)
         return impulses.reshape(-1, 3)
 
     def turned(self, points, axes):
@@ -64,6 +65,7 @@ class Touching:
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         allowed = velocities.copy()
-        if kernels.may_touch(allowed, self._step, self.state.room, self.state.near):
+        way = kernels.travel(allowed, self._step)
+        if kernels.is_near(self.state, points, allowed, self._step, way):
             kernels.keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
         return allowed

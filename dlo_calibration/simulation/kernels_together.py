@@ -1,0 +1,330 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Kernels for several DLOs at once: the rods of four DLOs are stepped in `lanes`, their contacts one by one.
+
+Each DLO gets the same positions, bit for bit, as by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numba
+
+from dlo_calibration.simulation.kernels import (
+    Cube,
+    entry,
+    FrameState,
+    IndexRows,
+    Indices,
+    is_near,
+    keep_apart,
+    let_follow,
+    Matrix,
+    part,
+    record,
+    rest_on_table,
+    rod_velocities,
+    RodState,
+    RopeState,
+    SelfContact,
+    SlipState,
+    travel,
+    turn_clamps,
+    TYPES,
+    Vector,
+)
+from dlo_calibration.simulation.lanes import COUNT, lanes_of, where
+
+GOES_ON, STABLE, DIVERGED = 0, 1, 2
+DRAG, IMPLICIT, FRICTION, LEVEL, TRAVEL, SOLVED = range(6)  # rows of `Together.numbers`
+
+
+@record
+class Move(NamedTuple):
+    """
+    What happens to one of the DLOs until its next event.
+
+    :param targets: (k, h, 3) [m] positions of the held nodes after each step; after k steps, they stay.
+    :param turns: (k, h, 9) of `turn_clamps` in each step, or (0, 0, 0).
+    :param path: (k, N, 3) [m] where the positions of all nodes after each step are written; or (0, 0, 0).
+    :param most: steps of the move, at most.
+    :param periods: (c,) steps between two checks whether the DLO is stable, the last one after `most` steps;
+        (0,): it is not checked.
+    :param seen: (c + 1, N, 3) [m] where the nodes were at the last checks.
+    :param distance: [m] it is stable if no node is further from the first of these places.
+    :param progress: (4,) steps taken; steps until the next check; checks made; how the move ended: `GOES_ON`,
+        `STABLE` or `DIVERGED`.
+    :param held: see `RodState`, like the following; they are those of the DLO.
+    :param points: see `RopeState`, like the following; workspace until the DLO leaves.
+    :param contact: contact of the DLO with itself.
+    """
+
+    targets: Cube
+    turns: Cube
+    path: Cube
+    most: int
+    periods: Indices
+    seen: Cube
+    distance: float
+    progress: Indices
+    held: Indices
+    follow: Matrix
+    inverse_masses: Vector
+    points: Matrix
+    predicted: Matrix
+    support: Matrix
+    contact: SelfContact
+
+
+@record
+class Together(NamedTuple):
+    """
+    `COUNT` DLOs of N nodes that are simulated together; the last axis is the DLO's.
+
+    What the arrays are is said at `RopeState`, `RodState`, `FrameState` and `SlipState`.
+
+    :param numbers: (6, COUNT) drag, `implicit`, friction, height of nodes on the table [m], how far
+        nodes may approach each other in a step [m], and 1 where the step could be solved.
+    :param lane: (COUNT,) 0, 1, 2, ...
+    :param gravity: (3,) is the same for all, like the following.
+    :param step: time step [s].
+    :param clamped: (s, 2).
+    :param begun: (1,) 1.
+    """
+
+    points: Cube
+    velocities: Cube
+    predicted: Cube
+    support: Cube
+    rest_lengths: Matrix
+    stiffness: Matrix
+    masses: Matrix
+    bending: Cube
+    bands: Cube
+    right: Matrix
+    natural: Cube
+    twisting: Matrix
+    angles: Matrix
+    clamps: Cube
+    carried: Cube
+    segments: Cube
+    joints: Cube
+    turning: Cube
+    rows: Cube
+    kept: Cube
+    pull: Cube
+    numbers: Matrix
+    lane: Indices
+    gravity: Vector
+    step: float
+    clamped: IndexRows
+    begun: Indices
+
+
+Moves = tuple[Move, ...]
+TYPES['Moves'] = numba.types.UniTuple(TYPES['Move'], COUNT)
+
+
+@part
+def _copy_in(lanes: Matrix, lane: int, numbers: Vector) -> None:
+    for i in range(len(numbers)):
+        lanes[i, lane] = numbers[i]
+
+
+@part
+def _copy_rows_in(lanes: Cube, lane: int, numbers: Matrix) -> None:
+    for i in range(numbers.shape[0]):
+        for k in range(numbers.shape[1]):
+            lanes[i, k, lane] = numbers[i, k]
+
+
+@part
+def _copy_out(lanes: Matrix, lane: int, numbers: Vector) -> None:
+    for i in range(len(numbers)):
+        numbers[i] = lanes[i, lane]
+
+
+@part
+def _copy_rows_out(lanes: Cube, lane: int, numbers: Matrix) -> None:
+    for i in range(numbers.shape[0]):
+        for k in range(numbers.shape[1]):
+            numbers[i, k] = lanes[i, k, lane]
+
+
+@entry
+def enter(rope: RopeState, level: float, together: Together, lane: int) -> None:
+    """Copy a DLO's state into a lane; `level` is the height of nodes that touch the table [m]."""
+    rod, frame, friction = rope.rod, rope.rod.frame, rope.rod.friction
+    _copy_rows_in(together.points, lane, rope.points)
+    _copy_rows_in(together.velocities, lane, rope.velocities)
+    _copy_rows_in(together.support, lane, rope.support)
+    _copy_in(together.rest_lengths, lane, rod.rest_lengths)
+    _copy_in(together.stiffness, lane, rod.stiffness)
+    _copy_in(together.masses, lane, rod.masses)
+    _copy_rows_in(together.bending, lane, rod.bending)
+    if len(frame.angles) > 0:
+        _copy_rows_in(together.natural, lane, frame.natural)
+        _copy_in(together.twisting, lane, frame.twisting)
+        _copy_in(together.angles, lane, frame.angles)
+        _copy_rows_in(together.clamps, lane, frame.clamps)
+        _copy_rows_in(together.carried, lane, frame.carried)
+        _copy_rows_in(together.joints, lane, frame.joints)
+    if len(friction.rows) > 0:
+        _copy_rows_in(together.rows, lane, friction.rows)
+        _copy_rows_in(together.kept, lane, friction.kept)
+    together.numbers[DRAG, lane], together.numbers[IMPLICIT, lane] = rod.drag, rod.implicit
+    together.numbers[FRICTION, lane], together.numbers[LEVEL, lane] = rope.contact.friction, level
+
+
+@entry
+def leave(rope: RopeState, together: Together, lane: int) -> None:
+    """Copy a DLO's state back from a lane."""
+    frame, friction = rope.rod.frame, rope.rod.friction
+    _copy_rows_out(together.points, lane, rope.points)
+    _copy_rows_out(together.velocities, lane, rope.velocities)
+    _copy_rows_out(together.support, lane, rope.support)
+    if len(frame.angles) > 0:
+        _copy_out(together.angles, lane, frame.angles)
+        _copy_rows_out(together.clamps, lane, frame.clamps)
+        _copy_rows_out(together.carried, lane, frame.carried)
+        _copy_rows_out(together.joints, lane, frame.joints)
+    if len(friction.rows) > 0:
+        _copy_rows_out(together.kept, lane, friction.kept)
+
+
+@part
+def _aim(move: Move, points: Cube, lane: int, step: float) -> None:
+    """Write the velocities of a DLO's held nodes in the next step."""
+    k = min(move.progress[0], len(move.targets) - 1)
+    for h in range(len(move.held)):
+        for c in range(3):
+            move.follow[h, c] = (move.targets[k, h, c] - points[move.held[h], c, lane]) / step
+
+
+@part
+def _follow_through(move: Move, together: Together, lane: int) -> None:
+    """Turn a DLO's clamps with their hands, and let it not pass through itself in the coming step."""
+    contact, points, predicted, support = move.contact, move.points, move.predicted, move.support
+    if len(move.turns) > 0:
+        turn_clamps(together.clamped, together.clamps[:, :, lane],
+                    move.turns[min(move.progress[0], len(move.turns) - 1)])
+    if together.numbers[SOLVED, lane] == 1.0 and is_near(
+            contact, together.points[:, :, lane], together.predicted[:, :, lane], together.step,
+            together.numbers[TRAVEL, lane]):
+        _copy_rows_out(together.points, lane, points)
+        _copy_rows_out(together.predicted, lane, predicted)
+        _copy_rows_out(together.support, lane, support)
+        keep_apart(contact, points, predicted, move.inverse_masses, support, together.step)
+        _copy_rows_in(together.predicted, lane, predicted)
+
+
+@part
+def _arrive(move: Move, together: Together, lane: int) -> bool:
+    """Put a DLO's held nodes where their hands are, and count the step; tell whether its move ended."""
+    progress, points = move.progress, together.points
+    if together.numbers[SOLVED, lane] == 0.0:
+        progress[3] = DIVERGED
+        return True
+    k = min(progress[0], len(move.targets) - 1)
+    for h in range(len(move.held)):
+        for c in range(3):
+            points[move.held[h], c, lane] = move.targets[k, h, c]
+    if len(move.path) > 0:
+        _copy_rows_out(points, lane, move.path[progress[0]])
+    progress[0] += 1
+    if len(move.periods) > 0:
+        progress[1] -= 1
+        if (progress[1] == 0 or progress[0] == move.most) and _is_stable(move, points, lane):
+            progress[3] = STABLE
+            return True
+    return False
+
+
+@part
+def _is_stable(move: Move, points: Cube, lane: int) -> bool:
+    """Check whether a DLO is stable: all its nodes have stayed where they were."""
+    seen, progress, count = move.seen, move.progress, len(move.periods)
+    progress[2] += 1
+    progress[1] = move.periods[progress[2] % count]
+    _copy_rows_out(points, lane, seen[progress[2] % (count + 1)])
+    if progress[2] < count:
+        return False
+    start, furthest = seen[(progress[2] + 1) % (count + 1)], 0.0
+    for check in range(count + 1):
+        for i in range(seen.shape[1]):
+            x, y = seen[check, i, 0] - start[i, 0], seen[check, i, 1] - start[i, 1]
+            z = seen[check, i, 2] - start[i, 2]
+            furthest = max(furthest, x * x + y * y + z * z)
+    return math.sqrt(furthest) < move.distance
+
+
+@entry
+def advance_together(moves: Moves, together: Together, count: int, used: int) -> int:
+    """
+    Take steps of several DLOs at once, each as `kernels.advance` would take it, until a move ends.
+
+    :param moves: of `COUNT` DLOs that have entered; those that are not used may be any of the others.
+    :param count: most steps to take.
+    :param used: how many of the DLOs are to move.
+    :returns: number of steps taken.
+    """
+    a, b, c, d = moves
+    lane, step = together.lane, together.step
+    lanes, masses = lanes_of(together.numbers), lanes_of(together.masses)
+    points, velocities = lanes_of(together.points), lanes_of(together.velocities)
+    predicted, support = lanes_of(together.predicted), lanes_of(together.support)
+    frame = FrameState(
+        lanes_of(together.natural), lanes_of(together.twisting), lanes_of(together.angles), together.clamped,
+        lanes_of(together.clamps), lanes_of(together.carried), together.begun, lanes_of(together.segments),
+        lanes_of(together.joints), lanes_of(together.turning))
+    friction = SlipState(
+        lanes_of(together.rows), lanes_of(together.kept), together.begun, lanes_of(together.pull))
+    held: Any = (a.held, b.held, c.held, d.held)
+    follow: Any = (a.follow, b.follow, c.follow, d.follow)
+    rod = RodState(
+        lanes_of(together.rest_lengths), lanes_of(together.stiffness), masses, masses,
+        lanes_of(together.bending), frame, friction, held, follow, lanes[DRAG], lanes[IMPLICIT], step,
+        lanes_of(together.bands), lanes_of(together.right))
+    for taken in range(count):
+        _aim(a, together.points, lane[0], step)
+        if used > 1:
+            _aim(b, together.points, lane[1], step)
+        if used > 2:
+            _aim(c, together.points, lane[2], step)
+        if used > 3:
+            _aim(d, together.points, lane[3], step)
+        for i in range(len(points)):
+            for k in range(3):
+                velocities[i, k] += step * together.gravity[k]
+        lanes[SOLVED] = where(rod_velocities(rod, points, velocities, predicted), 1.0, 0.0)
+        lanes[TRAVEL] = travel(predicted, step)
+        _follow_through(a, together, lane[0])
+        if used > 1:
+            _follow_through(b, together, lane[1])
+        if used > 2:
+            _follow_through(c, together, lane[2])
+        if used > 3:
+            _follow_through(d, together, lane[3])
+        for i in range(len(points)):
+            for k in range(3):
+                velocities[i, k] = predicted[i, k]
+        rest_on_table(points, velocities, lanes[LEVEL], lanes[FRICTION], step)
+        let_follow(velocities, rod.held, rod.follow)
+        for i in range(len(points)):
+            for k in range(3):
+                support[i, k] = velocities[i, k] - predicted[i, k]
+                points[i, k] += step * velocities[i, k]
+        ended = _arrive(a, together, lane[0])
+        if used > 1:
+            ended = _arrive(b, together, lane[1]) or ended
+        if used > 2:
+            ended = _arrive(c, together, lane[2]) or ended
+        if used > 3:
+            ended = _arrive(d, together, lane[3]) or ended
+        if ended:
+            return taken + 1
+    return count

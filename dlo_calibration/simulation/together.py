@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+roll_out_together(): several trials, or one with several parameter sets, simulated at the same time.
+
+Ropes of the same kind share the lanes of `kernels_together`; as soon as one of them comes to an event of
+its trial, its course goes on to the next steps, and another rope may take its lane.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+import math
+from typing import Callable, Hashable, Iterable, Sequence
+
+import numpy as np
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation import kernels_together
+from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.lanes import COUNT
+from dlo_calibration.simulation.protocol import advanced, Rollout
+from dlo_calibration.simulation.rollout import Course, PIECE, take
+from dlo_calibration.simulation.rope import diverged
+
+
+class Lanes:
+    """What `kernels_together` needs for ropes of one kind."""
+
+    def __init__(self, rope: CompiledRope) -> None:
+        rod, n = rope.state.rod, len(rope.state.points)
+        frame, friction = rod.frame, rod.friction
+
+        def room(array: Floats) -> Floats:
+            return _aligned(*array.shape, COUNT)
+
+        #: the state of the ropes in the lanes
+        self.state = kernels_together.Together(
+            points=_aligned(n, 3, COUNT), velocities=_aligned(n, 3, COUNT),
+            predicted=_aligned(n, 3, COUNT), support=_aligned(n, 3, COUNT),
+            rest_lengths=room(rod.rest_lengths), stiffness=room(rod.stiffness), masses=room(rod.masses),
+            bending=room(rod.bending), bands=room(rod.bands), right=room(rod.right),
+            natural=room(frame.natural), twisting=room(frame.twisting), angles=room(frame.angles),
+            clamps=room(frame.clamps), carried=room(frame.carried), segments=room(frame.segments),
+            joints=room(frame.joints), turning=room(frame.turning), rows=room(friction.rows),
+            kept=room(friction.kept), pull=room(friction.pull), numbers=_aligned(6, COUNT),
+            lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
+            begun=np.ones(1, np.int64))
+        self._ropes: list[Traveller] = []
+
+    def let_in(self, travellers: Sequence[Traveller]) -> None:
+        """Give these, at most `COUNT`, and no others, a lane each."""
+        places: list[Traveller | None] = [None] * len(travellers)
+        for lane, one in enumerate(self._ropes):
+            if one.inside and one in travellers and lane < len(travellers):
+                places[lane] = one
+            elif one.inside:
+                self.let_out(one)
+        coming = iter([one for one in travellers if one not in places])
+        for lane, place in enumerate(places):
+            if place is None:
+                place = places[lane] = next(coming)
+                kernels_together.enter(place.rope.state, place.rope.level, self.state, lane)
+                place.inside = True
+        self._ropes = [one for one in places if one is not None]
+
+    def let_out(self, one: Traveller) -> None:
+        """Give a rope its state back."""
+        kernels_together.leave(one.rope.state, self.state, self._ropes.index(one))
+        one.inside = False
+
+    def advance(self, count: int) -> None:
+        """Take steps of all ropes that are in, at most `count`, until one of their moves ends."""
+        moves = [one.move for one in self._ropes]
+        kernels_together.advance_together(
+            (*moves, *[moves[0]] * (COUNT - len(moves))), self.state, count, len(moves))
+        advanced()
+
+
+class Traveller:
+    """
+    A rope on the course of its trial.
+
+    :param number: of the rollout.
+    """
+
+    def __init__(self, number: int, rope: CompiledRope, course: Course) -> None:
+        self.number, self.rope, self._course = number, rope, course
+        self.inside = False  # whether its state is in a lane
+        self.kind: Hashable = None
+        self.outcome: Rollout | SimulationError | None = None
+        self._go_on(None)
+
+    @property
+    def left(self) -> int:
+        """The steps until its move ends, at most."""
+        return self._steps.count - int(self.move.progress[0])
+
+    @property
+    def arrived(self) -> bool:
+        """Whether its move has ended."""
+        return self.left == 0 or self.move.progress[3] != kernels_together.GOES_ON
+
+    def turn(self) -> None:
+        """Go on after a move."""
+        if self.move.progress[3] == kernels_together.DIVERGED:
+            self.outcome = diverged()
+        else:
+            self._go_on((int(self.move.progress[0]), bool(self.move.progress[3] == kernels_together.STABLE)))
+
+    def _go_on(self, taken: tuple[int, bool] | None) -> None:
+        """Find the next steps that can be taken together with others; take those that cannot."""
+        try:
+            while True:
+                self._steps = self._course.send(taken)
+                if self._begin_move():
+                    return
+                taken = take(self.rope, self._steps)
+        except StopIteration as end:
+            self.outcome = end.value
+        except SimulationError as error:
+            self.outcome = error
+
+    def _begin_move(self) -> bool:
+        """Begin the next steps; tell whether they can be taken together with others."""
+        rope, steps = self.rope, self._steps
+        periods = steps.periods(rope.time_step)
+        first = 0 if rope.has_begun else 1
+        if steps.count <= first or len(periods) and periods[0] <= first:
+            return False
+        seen = np.empty((0, 0, 0))
+        if len(periods):
+            seen = np.empty((len(periods) + 1, *rope.state.points.shape))
+            seen[0] = rope.state.points
+        if first:
+            rope.advance(steps.targets[:1], None if steps.path is None else steps.path[:1],
+                         None if steps.turns is None else steps.turns[:1])
+        until_check = periods[0] - first if len(periods) else 0
+        state, rod = rope.state, rope.state.rod
+        self.kind = rope.kind
+        self.move = kernels_together.Move(
+            targets=np.ascontiguousarray(steps.targets),
+            turns=np.empty((0, 0, 0)) if steps.turns is None else np.ascontiguousarray(steps.turns),
+            path=np.empty((0, 0, 0)) if steps.path is None else steps.path, most=steps.count,
+            periods=periods, seen=seen,
+            distance=0.0 if steps.settling is None else steps.settling.distance,
+            progress=np.array([first, until_check, 0, kernels_together.GOES_ON]), held=rod.held,
+            follow=rod.follow, inverse_masses=rod.inverse_masses, points=state.points,
+            predicted=state.predicted, support=state.support, contact=state.contact)
+        return True
+
+
+def roll_out_together(starts: Iterable[Callable[[], tuple[CompiledRope, Course]]],
+                      between: Callable[[], None]) -> list[Rollout | SimulationError]:
+    """
+    Simulate trials together.
+
+    :param starts: each returns a rope at the start of a trial, and the course of the trial.
+    :param between: is called again and again; what it raises ends the simulation.
+    :returns: the rollouts, or why they failed, in order.
+    """
+    waiting = deque(enumerate(starts))
+    found: list[Rollout | SimulationError | None] = [None] * len(waiting)
+    travellers: list[Traveller] = []
+    rooms: dict[Hashable, Lanes] = {}
+    kind: Hashable = None
+    while waiting or travellers:
+        between()
+        while waiting and len(travellers) < 2 * COUNT:
+            number, start = waiting.popleft()
+            travellers.append(Traveller(number, *start()))
+        for one in [one for one in travellers if one.outcome is not None]:
+            found[one.number] = one.outcome
+            travellers.remove(one)
+        if not travellers:
+            continue
+        counts = Counter(one.kind for one in travellers)
+        if counts[kind] < min(COUNT, max(counts.values())):
+            if kind in rooms:
+                rooms[kind].let_in([])
+            kind = counts.most_common(1)[0][0]
+        going = sorted((one for one in travellers if one.kind == kind), key=lambda one: not one.inside)
+        going = going[:COUNT]
+        if kind not in rooms:
+            rooms[kind] = Lanes(going[0].rope)
+        lanes = rooms[kind]
+        lanes.let_in(going)
+        lanes.advance(min(PIECE, *(one.left for one in going)))
+        for one in going:
+            if one.arrived:
+                lanes.let_out(one)
+                one.turn()
+    return [one for one in found if one is not None]
+
+
+def _aligned(*shape: int) -> Floats:
+    """Return zeros at an address at which lanes do not lie across two lines of the processor's cache."""
+    room = np.zeros(math.prod(shape) + 8)
+    start = -(room.ctypes.data // 8) % 8
+    return room[start:start + math.prod(shape)].reshape(shape)
