@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.plain import plain
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import shortened, told
@@ -184,13 +185,18 @@ def print_result(result: CalibrationResult, stream: TextIO,
 def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
     """Print the JSON document of `info` as tables."""
     out, unknown = console(stream), {one['topic']: one for one in about['unknown_topics']}
+    defaults = Options().flat()
+    recorded = [f'{name} {value}' for name, value in (about['options'] or {}).items()
+                if name != 'calibrate' and value != defaults.get(name)]
+    facts = [('trials', str(len(about['trials'])))]
+    if about['messages']:  # a request has none
+        facts += [('duration', f"{number(about['duration_s'])} s"),
+                  ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
+                  *((topic, f"{count} message{'s' * (count != 1)}")
+                    for topic, count in about['messages'].items() if topic not in unknown)]
     out.print(facts_table(about['session'], [
-        ('trials', str(len(about['trials']))),
-        ('duration', f"{number(about['duration_s'])} s"),
-        ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
-        *((topic, f'{count} messages') for topic, count in about['messages'].items() if topic not in unknown),
-        ('calibrate', about['choice'] or ', '.join(about['calibrate'])),
-    ]))
+        *facts, ('options', shortened(', '.join(recorded)) or 'all have their defaults'),
+        ('calibrate', about['choice'].removeprefix('Calibrated: ') or ', '.join(about['calibrate']))]))
     if unknown:
         keys = ('topic', 'type', 'messages')
         out.print(rows_table('topics that the calibrator does not know', keys, [
@@ -208,7 +214,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
                  (f"mean of {trial['averaged_chains']} chains at rest", trial['averaged_chains']),
                  ('annotated hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
-                (f"unseen points: {trial['unseen_points']}", trial['unseen_points'])) if there) or '-')
+                 (f"unseen points: {trial['unseen_points']}", trial['unseen_points'])) if there) or '-')
             for trial in about['trials']]))
     for title in ('refusals', 'problems'):
         for text in about[title]:
