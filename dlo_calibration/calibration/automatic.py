@@ -80,5 +80,5 @@ def _parameters(trials: Sequence[Trial]) -> tuple[tuple[str, ...], str]:
             names += added
             words += f'; {", ".join(added)}, because {why}'
     if names == PAPER_PARAMETERS:
-        words += ', because no goal was seen in motion'
+        words += f'; not {", ".join(IN_MOTION)}, because no goal was seen in motion'
     return names, f'{words}.'

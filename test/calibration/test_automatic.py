@@ -49,8 +49,8 @@ def test_trials_at_rest_give_the_papers_four_and_the_same_result():
     choice = choose(trials, options)
     assert (choice.options.calibrate, choice.options.evaluations) == (
         PAPER_PARAMETERS, PAPER_ROUNDS + REFINEMENT)
-    assert choice.words == ('Calibrated: flexibility, elasticity, friction, self_collision, '
-                            'because no goal was seen in motion.')
+    assert choice.words == ('Calibrated: flexibility, elasticity, friction, self_collision; '
+                            'not damping, internal_damping, because no goal was seen in motion.')
     auto, named = (calibrate(trials, replace(one, evaluations=20), make_simulator=new_toy)
                    for one in (options, choice.options))
     assert [one.score for one in auto.evaluations] == [one.score for one in named.evaluations]
