@@ -31,6 +31,9 @@ from dlo_calibration.ros.situation import Pace
 
 LOG = logging.getLogger('dlo_calibration')  # where the rest of the package logs its notices
 TICK = 0.05  # s between two ticks of the session, short enough for its shortest period (progress)
+# s for which a thread that calibrates or draws keeps the interpreter's lock.  A callback gives it up twenty
+# times, and waits as often: Python's own 0.005 s would make that 0.1 s.
+SWITCH = 0.0005
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -54,6 +57,7 @@ def spin(program: str, make_node: Callable[[], GraphNode[Any]], args: Sequence[s
             return 0
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
+        sys.setswitchinterval(SWITCH)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         while not should_stop() and rclpy.ok():
