@@ -195,9 +195,10 @@ def test_full_disk_is_told_once_and_the_calibration_goes_on(ros_environment, tmp
         assert robot.call('start').success
         assert whole_result(robot)['trials'] == '4'
         robot.until(lambda: robot.status['last_refusal'])
-        robot.until(lambda: len(robot.heard['log']) > 1 and any(
-            log.level >= LOG_WARN for log in robot.heard['log']))
-        errors = [log.msg for log in robot.heard['log'] if log.level >= LOG_WARN]
+        robot.until(lambda: any('cannot be written' in log.msg for log in robot.heard['log']))
+        # A search with so few evaluations has not reached a minimum, which is told, too.
+        errors = [log.msg for log in robot.heard['log'] if log.level >= LOG_WARN
+                  and not log.msg.startswith('Do not use this result')]
     text, = errors
     assert robot.status['last_refusal'] == text
     for word in ('session', str(tmp_path), 'cannot be written', os.strerror(errno.ENOSPC)):
