@@ -29,7 +29,7 @@ ONLY = {
     'pybullet': ('simulation/bullet_world.py', 'simulation/window.py'),
     'cv2': ('capture',),
     'PIL': ('capture',),
-    'numba': ('simulation/kernels.py', 'capture/path.py'),
+    'numba': ('simulation/kernels.py', 'simulation/kernels_together.py', 'simulation/lanes.py', 'capture/path.py'),
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
