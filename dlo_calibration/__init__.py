@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from dlo_calibration.errors import DloCalibrationError, InputError, SimulationError
     from dlo_calibration.evaluation.log import EvaluationLog
     from dlo_calibration.export.mjcf import export_mjcf
+    from dlo_calibration.export.sdf import export_sdf
+    from dlo_calibration.export.usd import export_usd
     from dlo_calibration.files.result import read_result
     from dlo_calibration.files.session import read_session
     from dlo_calibration.model.action import Action, Hand
@@ -30,8 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     'Action', 'BulletRope', 'Chain', 'DloCalibrationError', 'EvaluationLog', 'Goal', 'Hand',
-    'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'export_mjcf', 'plan',
-    'read_result', 'read_session', 'simulate',
+    'InputError', 'Options', 'PlanOptions', 'SimulationError', 'Trial', 'calibrate', 'export_mjcf',
+    'export_sdf', 'export_usd', 'plan', 'read_result', 'read_session', 'simulate',
 ]
 
 _MODULES = {
@@ -45,6 +47,8 @@ _MODULES = {
     'planning.prediction': ('simulate',),
     'evaluation.log': ('EvaluationLog',),
     'export.mjcf': ('export_mjcf',),
+    'export.sdf': ('export_sdf',),
+    'export.usd': ('export_usd',),
     'files.session': ('read_session',),
     'files.result': ('read_result',),
     'simulation.bullet': ('BulletRope',),

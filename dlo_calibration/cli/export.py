@@ -14,8 +14,9 @@ from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli.options import add_options, given_options
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import InputError, one_of
-from dlo_calibration.export import export_mjcf
+from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
+from dlo_calibration.export.usd import FORMS as USD_FORMS
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.writing import whole
@@ -23,14 +24,16 @@ from dlo_calibration.writing import whole
 TEXT = 'write a calibrated DLO as a file for another simulator'
 USED = ('nodes', 'table', 'table_height')  # options
 #: Format -> what makes its text, and the names of its forms, the first one by default.
-FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {'mjcf': (export_mjcf, MJCF_FORMS)}
+FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {
+    'mjcf': (export_mjcf, MJCF_FORMS), 'usd': (export_usd, USD_FORMS), 'sdf': (export_sdf, ())}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     forms = '; '.join(f'of {name}: {", ".join(known)}' for name, (_, known) in FORMATS.items() if known)
     parser.add_argument('result', metavar='RESULT.xml', type=Path, help='the calibrated DLO')
-    parser.add_argument('--format', required=True, choices=tuple(FORMATS), help='mjcf: MuJoCo 3 and 4')
+    parser.add_argument('--format', required=True, choices=tuple(FORMATS), help=(
+        'mjcf: MuJoCo 3 and 4; usd: Newton and Isaac Lab; sdf: Gazebo'))
     parser.add_argument('--from', dest='start', metavar='CHAIN', type=Path, required=True, help=(
         'where the DLO lies: a CSV file with rows x,y,z [m], first point to last, or an XML document'))
     parser.add_argument('--output', metavar='FILE', type=Path, required=True, help='the file to write')

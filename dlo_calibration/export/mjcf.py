@@ -24,7 +24,7 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, one_of
-from dlo_calibration.export.rope import ExportedRope
+from dlo_calibration.export.rope import ExportedRope, quaternion
 from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.quantity import interval, measured
@@ -106,7 +106,7 @@ class _Writer:
         across = mass * (length**2 / 12 + rope.radius**2 / 4)
         if k == 0:
             body = add(parent, 'body', name=f'{NAME}_0', pos=_text(rope.points[0]),
-                       quat=_text(_quaternion(rope.frames[0])), childclass=NAME)
+                       quat=_text(quaternion(rope.frames[0])), childclass=NAME)
             add(body, 'freejoint', name=f'{NAME}_root')
         else:
             body = add(parent, 'body', name=f'{NAME}_{k}', pos=_text([rope.rest_lengths[k - 1], 0, 0]),
@@ -144,12 +144,12 @@ class _Writer:
     def _start(self, turns: Floats) -> Floats:
         """Return the positions of all joints at the observed chain."""
         rope = self._rope
-        found = [rope.points[0], _quaternion(rope.frames[0])]
+        found = [rope.points[0], quaternion(rope.frames[0])]
         for k, rest in enumerate(turns):
             if self._stretches:
                 found.append(np.zeros(1))
             found.append(_product(rest * [1, -1, -1, -1],
-                                  _quaternion(rope.frames[k].T @ rope.frames[k + 1])))
+                                  quaternion(rope.frames[k].T @ rope.frames[k + 1])))
         return np.concatenate(found)
 
     def _stretched(self) -> Floats:
@@ -217,20 +217,6 @@ def _rest_turns(rope: ExportedRope) -> Floats:
     axes = np.column_stack([np.zeros(len(bends)), -bends[:, 1], bends[:, 0]])
     share = np.sinc(sizes / 2 / np.pi) / 2
     return np.column_stack([np.cos(sizes / 2), axes * share[:, None]])
-
-
-def _quaternion(rotation: Floats) -> Floats:
-    """Return the quaternion w x y z, (4,), of a (3, 3) rotation matrix, with w >= 0."""
-    m = rotation
-    found = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-                      [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-                      [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-                      [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]]])
-    # The eigenvector of the largest eigenvalue (Bar-Itzhack, New Method for Extracting the Quaternion from a
-    # Rotation Matrix, 2000).
-    _, vectors = np.linalg.eigh(found + np.triu(found, 1).T)
-    best = vectors[:, -1]
-    return np.asarray(best if best[0] >= 0 else -best)
 
 
 def _product(one: Floats, other: Floats) -> Floats:

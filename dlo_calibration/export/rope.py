@@ -85,6 +85,25 @@ class ExportedRope:
         """Length at rest [m]."""
         return float(self.rest_lengths.sum())
 
+    @property
+    def slender(self) -> bool:
+        """Whether only neighbours among the segments touch each other where the DLO is straight."""
+        return bool(self.rest_lengths.min() > 2 * self.radius)
+
+    @property
+    def rest_frames(self) -> Floats:
+        """
+        Material frames of the segments in the rest shape, (n - 1, 3, 3), the first as at the start.
+
+        They turn from segment to segment by the smallest rotation, as in `model.bending.rest_shape`.
+        """
+        frames = [self.frames[0]]
+        for bend in self.natural_curvature * self.cells[:, None]:
+            size = float(np.linalg.norm(bend))
+            along = np.array([np.cos(size), *(np.sinc(size / np.pi) * bend)])
+            frames.append(frames[-1] @ smallest_rotation(np.array([1.0, 0.0, 0.0]), along))
+        return np.array(frames)
+
     def place_of(self, place: float) -> tuple[int, float]:
         """Return the segment at an arc length [m], and how far from its first node it is [m]."""
         ends = np.concatenate([[0.0], np.cumsum(self.rest_lengths)])
@@ -191,6 +210,20 @@ def smallest_rotation(one: Floats, other: Floats) -> Floats:
         return np.asarray(2 * np.outer(across, across) - np.eye(3))
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))
+
+
+def quaternion(rotation: Floats) -> Floats:
+    """Return the quaternion w x y z, (4,), of a (3, 3) rotation matrix, with w >= 0."""
+    m = rotation
+    found = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+                      [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+                      [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+                      [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]]])
+    # The eigenvector of the largest eigenvalue (Bar-Itzhack, New Method for Extracting the Quaternion from a
+    # Rotation Matrix, 2000).
+    _, vectors = np.linalg.eigh(found + np.triu(found, 1).T)
+    best = vectors[:, -1]
+    return np.asarray(best if best[0] >= 0 else -best)
 
 
 def _values(found: CalibratedDlo) -> tuple[str, ...]:

@@ -6,7 +6,7 @@
 import pytest
 
 from dlo_calibration.cli import main as cli
-from dlo_calibration.export.mjcf import export_mjcf
+from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.samples import samples
@@ -28,10 +28,11 @@ def export(capsys, tmp_path):
     return export
 
 
-def test_it_writes_what_the_function_returns(export):
-    code, _, file = export('--format', 'mjcf')
+@pytest.mark.parametrize('name, function', [('mjcf', export_mjcf), ('usd', export_usd), ('sdf', export_sdf)])
+def test_it_writes_what_the_function_returns(export, name, function):
+    code, _, file = export('--format', name)
     assert code == 0
-    assert file.read_text() == export_mjcf(read_result(ROPE), read_chain_file(START))
+    assert file.read_text() == function(read_result(ROPE), read_chain_file(START))
 
 
 def test_it_takes_a_form_and_options(export):
@@ -44,6 +45,7 @@ def test_it_takes_a_form_and_options(export):
 
 @pytest.mark.parametrize('words, said', [
     (['--format', 'mjcf', '--form', 'soft'], "'soft', expected one of extensible, inextensible"),
+    (['--format', 'sdf', '--form', 'soft'], 'sdf has only one'),
     (['--format', 'urdf'], 'urdf'),
     (['--format', 'mjcf', '--nodes', '3'], 'nodes'),
 ])

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+SDF: a calibrated DLO for Gazebo, as a chain of cylinders that universal joints connect.
+
+Each of the two axes of a joint has the stiffness EI / l and its damping.  The links stand as the observed
+chain, where all angles are 0; `spring_reference` is the angle at which the joint is free of stress.  The
+first axis is that of the rotation from the start to the rest shape, so that the second one needs no
+reference, and both are across the DLO where it is at rest.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.export.rope import ExportedRope, quaternion
+from dlo_calibration.files.xml import add, add_comment, document, new_root
+from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.quantity import measured
+from dlo_calibration.planning.dlo import CalibratedDlo
+
+NAME = 'dlo'  # begins the names of links, joints and frames
+VERSION = '1.9'  # Gazebo Fortress and later
+
+
+def export_sdf(found: CalibratedDlo, chain: Chain, *, options: Options | None = None) -> str:
+    """
+    Return a calibrated DLO at an observed chain as the text of an SDF model.
+
+    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param options: see `ExportedRope.of`.
+    """
+    rope = ExportedRope.of(found, chain, options)
+    root = new_root('sdf')
+    root.set('version', VERSION)
+    model = add(root, 'model', name=NAME)
+    add_comment(model, _about(rope))
+    _add(model, 'self_collide', 'true' if rope.slender else 'false')
+    for segment, start in enumerate(_starts(rope)):
+        _add_link(model, rope, segment, start)
+    # From the last joint to the first: Gazebo places the second link relative to the first one, whose
+    # rotation is then still exact; else rounding errors double from link to link.
+    rest = rope.rest_frames
+    for joint in range(len(rest) - 1, 0, -1):
+        _add_joint(model, rope, joint, rest)
+    for point, place in enumerate(rope.point_places.tolist()):
+        segment, along = rope.place_of(place)
+        frame = add(model, 'frame', name=f'{NAME}_point_{point}', attached_to=f'{NAME}_{segment}')
+        _add(frame, 'pose', [along, 0, 0, 0, 0, 0])
+    return document(root).decode()
+
+
+def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> None:
+    """Add a link whose frame lies at the start of the segment, (3,) [m], x along it."""
+    link, length = add(model, 'link', name=f'{NAME}_{segment}'), float(rope.rest_lengths[segment])
+    w, *vector = quaternion(rope.frames[segment])
+    pose = _add(link, 'pose', [*start, *vector, w])
+    pose.set('rotation_format', 'quat_xyzw')
+    _add_inertia(link, rope, segment)
+    for kind in ('collision', 'visual'):
+        shape = add(link, kind, name=kind)
+        _add(shape, 'pose', [length / 2, 0, 0, 0, np.pi / 2, 0])
+        # In Gazebo Fortress, a lying capsule sinks into a box by its radius.
+        form = add(add(shape, 'geometry'), 'cylinder' if kind == 'collision' else 'capsule')
+        _add(form, 'radius', rope.radius)
+        _add(form, 'length', length)
+        if kind == 'collision':
+            friction = add(add(shape, 'surface'), 'friction')
+            for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
+                one = add(friction, engine)
+                for name in names:
+                    _add(one, name, rope.friction)
+        else:
+            _add(add(shape, 'material'), 'diffuse', [0.9, 0.6, 0.2, 1])
+
+
+def _add_inertia(link: Any, rope: ExportedRope, segment: int) -> None:
+    """Add the inertia of a cylinder, with the markers at its ends; the two segments beside one share it."""
+    length, mass = float(rope.rest_lengths[segment]), float(rope.masses[segment])
+    shares = np.array([0.5, 0.5]) + 0.5 * (np.array([segment, segment + 2 - len(rope.points)]) == 0)
+    ends = shares * rope.marker_masses[segment:segment + 2]
+    whole = mass + float(ends.sum())
+    centre = (mass / 2 + float(ends[1])) * length / whole
+    across = mass * (length**2 / 12 + rope.radius**2 / 4 + (length / 2 - centre)**2) + float(
+        ends[0] * centre**2 + ends[1] * (length - centre)**2)
+    inertial = add(link, 'inertial')
+    _add(inertial, 'pose', [centre, 0, 0, 0, 0, 0])
+    _add(inertial, 'mass', whole)
+    inertia = add(inertial, 'inertia')
+    for name, value in (('ixx', mass * rope.radius**2 / 2), ('iyy', across), ('izz', across),
+                        ('ixy', 0), ('ixz', 0), ('iyz', 0)):
+        _add(inertia, name, value)
+
+
+def _add_joint(model: Any, rope: ExportedRope, joint: int, rest: Floats) -> None:
+    """Add the joint at the first node of a segment; `rest` are the frames in the rest shape."""
+    one = add(model, 'joint', name=f'{NAME}_bend_{joint}', type='universal')
+    _add(one, 'parent', f'{NAME}_{joint - 1}')
+    _add(one, 'child', f'{NAME}_{joint}')
+    stiffness = rope.bending_stiffness[joint - 1] / rope.cells[joint - 1]
+    both = slice(joint - 1, joint + 1)
+    axes, reference = _axes(rope.frames[both], rest[both])
+    for tag, axis, angle in (('axis', axes[0], reference), ('axis2', axes[1], 0.0)):
+        element = add(one, tag)
+        _add(element, 'xyz', axis)
+        dynamics = add(element, 'dynamics')
+        _add(dynamics, 'spring_reference', angle)
+        _add(dynamics, 'spring_stiffness', stiffness)
+        _add(dynamics, 'damping', stiffness * rope.internal_damping)
+
+
+def _axes(start: Floats, rest: Floats) -> tuple[Floats, float]:
+    """
+    Return both axes of a joint, (2, 3) in the frame of its second link, and the reference of the first [rad].
+
+    :param start: (2, 3, 3) frames of both links at the start.
+    :param rest: (2, 3, 3) in the rest shape.
+    """
+    # The frame of the second link at rest, seen from where it is at the start.
+    turn = start[1].T @ start[0] @ rest[0].T @ rest[1]
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    sine = float(np.linalg.norm(axis)) / 2
+    if sine < 1e-9:
+        return np.eye(3)[1:], 0.0
+    first = axis / (2 * sine)
+    second = np.cross([1.0, 0.0, 0.0], first)
+    angle = float(np.arctan2(sine, (np.trace(turn) - 1) / 2))
+    return np.array([first, second / np.linalg.norm(second)]), angle
+
+
+def _starts(rope: ExportedRope) -> Floats:
+    """Return where the segments begin, (n - 1, 3) [m]: the nodes, as far as the lengths at rest allow."""
+    steps = rope.frames[:, :, 0] * rope.rest_lengths[:, None]
+    starts = np.concatenate([[np.zeros(3)], np.cumsum(steps, axis=0)])
+    return np.asarray((starts - starts.mean(axis=0) + rope.points.mean(axis=0))[:-1])
+
+
+def _about(rope: ExportedRope) -> list[str]:
+    """Return what a reader of the file must know."""
+    lines = [
+        'A calibrated DLO, by dlo_calibration, for Gazebo with the physics engine DART. SI units.',
+        *rope.values, *rope.remarks,
+        'Kept: EI / l and its damping as springs of the joints, mass, friction, radius, and the rest shape '
+        'as spring_reference. The frames dlo_point_i are the points of the chain.',
+        f'Not kept: EA = {measured(rope.stretching_stiffness, "N")}, the links are rigid; twist, which '
+        f'universal joints do not allow; drag, {measured(rope.drag, "1/s")}; resistance to rolling, which '
+        'DART does not have: a bent DLO can roll on a table.']
+    if rope.bending_friction > 0:
+        lines.append('Not kept: friction between the strands, bending_friction.')
+    if not rope.slender:
+        lines.append('The segments are shorter than the DLO is thick: self_collide is false, as links that '
+                     'are near each other along the DLO would push each other away. Fewer nodes allow it.')
+    return lines
+
+
+def _add(parent: Any, tag: str, value: Any) -> Any:
+    """Add an element with text: a word, or numbers."""
+    element = add(parent, tag)
+    element.text = value if isinstance(value, str) else ' '.join(
+        repr(one) for one in np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+    return element

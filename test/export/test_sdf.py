@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""SDF: where the links stand, how stiff the joints are, and where they are free of stress."""
+
+from dataclasses import replace
+
+from bent import arc
+from calibrated import MadeUpDlo, straight
+from lxml import etree
+import numpy as np
+import pytest
+
+from dlo_calibration import Chain, Options
+from dlo_calibration.export import export_sdf, ExportedRope
+from dlo_calibration.model.bending import rest_shape
+from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
+from dlo_calibration.model.pose import Pose
+
+OPTIONS = Options(nodes=13)
+
+
+def with_values(**fixed):
+    """Return a DLO with other values of fixed parameters, on the 0..100 scale."""
+    return MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS, fixed, mass=0.03))
+
+
+def model_of(found, chain, options=OPTIONS):
+    """Return the model in the file."""
+    return etree.fromstring(export_sdf(found, chain, options=options).encode()).find('model')
+
+
+def numbers(element, path):
+    """Return the numbers in an element."""
+    return np.array([float(word) for word in element.findtext(path).split()])
+
+
+def poses(model):
+    """Return the poses of the links."""
+    return [Pose(one[:3], one[3:]) for one in (numbers(link, 'pose') for link in model.findall('link'))]
+
+
+def turned(axis, angle):
+    """Return the (3, 3) rotation about an axis, (3,)."""
+    half = axis * np.sin(angle / 2)
+    return Pose(np.zeros(3), np.array([*half, np.cos(angle / 2)])).rotation
+
+
+def at_rest(model):
+    """Return the nodes, (n, 3), where all springs are free of stress."""
+    start, joints = poses(model), model.findall('joint')[::-1]
+    rotation, points = start[0].rotation, [np.zeros(3)]
+    for one, other, joint in zip(start[:-1], start[1:], joints, strict=True):
+        points.append(points[-1] + rotation @ [np.linalg.norm(other.position - one.position), 0, 0])
+        first, second = (turned(numbers(axis, 'xyz'), numbers(axis, 'dynamics/spring_reference')[0])
+                         for axis in (joint.find('axis'), joint.find('axis2')))
+        rotation = rotation @ one.rotation.T @ other.rotation @ first @ second
+    return np.array([*points, points[-1] + rotation @ [np.linalg.norm(points[1]), 0, 0]])
+
+
+def test_the_links_stand_as_the_chain():
+    model, chain = model_of(MadeUpDlo(), arc()), arc()
+    assert [link.get('name') for link in model.findall('link')] == [f'dlo_{k}' for k in range(12)]
+    starts = np.array([one.position for one in poses(model)])
+    assert starts == pytest.approx(chain.resample(np.linspace(0, chain.length, 13))[:-1], abs=5e-4)
+    for one, other in zip(poses(model)[:-1], poses(model)[1:], strict=True):
+        assert one.points(np.array([numbers(model, 'link/collision/geometry/cylinder/length')[0], 0, 0])
+                          ) == pytest.approx(other.position)
+
+
+@pytest.mark.parametrize('axis', ['axis', 'axis2'])
+def test_the_springs_have_the_stiffness_and_the_damping_that_was_found(axis):
+    rope = ExportedRope.of(with_values(stiffness_2=70.0, internal_damping=50.0), arc(), OPTIONS)
+    joints = model_of(with_values(stiffness_2=70.0, internal_damping=50.0), arc()).findall('joint')[::-1]
+    stiffness = [numbers(joint, f'{axis}/dynamics/spring_stiffness')[0] for joint in joints]
+    assert stiffness * rope.cells == pytest.approx(rope.bending_stiffness)
+    assert [numbers(joint, f'{axis}/dynamics/damping')[0] for joint in joints] == pytest.approx(
+        rope.internal_damping * np.array(stiffness))
+
+
+@pytest.mark.parametrize('angle', [1.0, -4.0])
+def test_a_bent_start_is_under_stress_until_it_is_straight(angle):
+    points = at_rest(model_of(MadeUpDlo(), arc(angle)))
+    assert points - points[0] == pytest.approx(np.outer(np.linspace(0, 1, 13), points[-1]), abs=1e-9)
+
+
+def test_a_curved_rest_shape_is_where_the_springs_are_free_of_stress():
+    found = with_values(natural_curvature=30.0)
+    points = at_rest(model_of(found, arc(2.0)))
+    expected = rest_shape(ExportedRope.of(found, arc(2.0), OPTIONS).natural_curvature, 0.6)
+    between = [np.linalg.norm(shape[:, None] - shape, axis=-1) for shape in (points, expected)]
+    assert between[0] == pytest.approx(between[1], abs=1e-4)
+
+
+def test_both_axes_are_across_the_dlo_where_it_is_at_rest():
+    for joint in model_of(MadeUpDlo(), Chain(np.random.default_rng(2).normal(size=(9, 3)))).findall('joint'):
+        first, second = numbers(joint, 'axis/xyz'), numbers(joint, 'axis2/xyz')
+        turn = turned(first, numbers(joint, 'axis/dynamics/spring_reference')[0])
+        along = turn @ [1, 0, 0]  # of the second link at rest
+        assert [first @ second, first @ along, (turn @ second) @ along] == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+def test_the_links_weigh_what_the_dlo_and_its_markers_weigh():
+    chain = Chain(straight().points, features=np.isin(np.arange(21), [0, 10, 20]))
+    model = model_of(with_values(marker_mass=60.0), chain)
+    marker = 1e-6 * 10**3.0
+    masses = [numbers(link, 'inertial/mass')[0] for link in model.findall('link')]
+    assert sum(masses) == pytest.approx(0.03 + 3 * marker)
+    assert masses[0] == pytest.approx(0.03 / 12 + marker)
+    centre = sum(mass * (one.position[0] + numbers(link, 'inertial/pose')[0]) for mass, one, link in zip(
+        masses, poses(model), model.findall('link'), strict=True))
+    assert centre == pytest.approx(0.3 * sum(masses))
+
+
+def test_frames_are_at_the_points_of_the_chain():
+    model, chain = model_of(MadeUpDlo(), arc()), arc()
+    links = dict(zip([link.get('name') for link in model.findall('link')], poses(model), strict=True))
+    for point, frame in zip(chain.points, model.findall('frame'), strict=True):
+        link = links[frame.get('attached_to')]
+        assert link.points(numbers(frame, 'pose')[:3]) == pytest.approx(point, abs=2e-3)
+
+
+@pytest.mark.parametrize(('nodes', 'touches'), [(13, 'true'), (121, 'false')])
+def test_links_that_overlap_their_neighbours_do_not_collide(nodes, touches):
+    model = model_of(MadeUpDlo(), straight(), Options(nodes=nodes))
+    assert model.findtext('self_collide') == touches
+    assert ('self_collide is false' in etree.tostring(model, encoding='unicode')) == (touches == 'false')
+
+
+def test_a_verdict_of_a_stranger_cannot_end_the_comment():
+    class Hostile(MadeUpDlo):
+        @property
+        def parameters(self):
+            return {name: replace(one, verdict='--><link name="x"/>\0')
+                    for name, one in super().parameters.items()}
+
+    model = model_of(Hostile(), straight())
+    assert model.find("link[@name='x']") is None
+    assert 'EI: 0.00' in model.find('.').getchildren()[0].text
+
+
+def test_drake_reads_it():
+    parsing = pytest.importorskip('pydrake.multibody.parsing', reason='needs Drake')
+    from pydrake.multibody.plant import MultibodyPlant
+
+    plant = MultibodyPlant(1e-3)
+    parsing.Parser(plant).AddModelsFromString(export_sdf(MadeUpDlo(), arc(), options=OPTIONS), 'sdf')
+    plant.Finalize()
+    assert plant.num_positions() == 7 + 2 * 11
