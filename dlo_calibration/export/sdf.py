@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-SDF: a calibrated DLO for Gazebo, as a chain of cylinders that universal joints connect.
+SDF: a calibrated DLO for Gazebo, as a chain of links that universal joints connect.
 
 Each of the two axes of a joint has the stiffness EI / l and its damping.  The links stand as the observed
 chain, where all angles are 0; `spring_reference` is the angle at which the joint is free of stress.  The
 first axis is that of the rotation from the start to the rest shape, so that the second one needs no
 reference, and both are across the DLO where it is at rest.
+
+Links collide as boxes: DART has no friction against rolling, so that a round DLO which lies bent would roll
+until it is straight.  (And in Gazebo Fortress, a lying capsule sinks into a box by its radius.)
 """
 
 from __future__ import annotations
@@ -61,21 +64,20 @@ def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> No
     pose = _add(link, 'pose', [*start, *vector, w])
     pose.set('rotation_format', 'quat_xyzw')
     _add_inertia(link, rope, segment)
-    for kind in ('collision', 'visual'):
-        shape = add(link, kind, name=kind)
-        _add(shape, 'pose', [length / 2, 0, 0, 0, np.pi / 2, 0])
-        # In Gazebo Fortress, a lying capsule sinks into a box by its radius.
-        form = add(add(shape, 'geometry'), 'cylinder' if kind == 'collision' else 'capsule')
-        _add(form, 'radius', rope.radius)
-        _add(form, 'length', length)
-        if kind == 'collision':
-            friction = add(add(shape, 'surface'), 'friction')
-            for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
-                one = add(friction, engine)
-                for name in names:
-                    _add(one, name, rope.friction)
-        else:
-            _add(add(shape, 'material'), 'diffuse', [0.9, 0.6, 0.2, 1])
+    collision = add(link, 'collision', name='collision')
+    _add(collision, 'pose', [length / 2, 0, 0, 0, 0, 0])
+    _add(add(add(collision, 'geometry'), 'box'), 'size', [length, 2 * rope.radius, 2 * rope.radius])
+    friction = add(add(collision, 'surface'), 'friction')
+    for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
+        one = add(friction, engine)
+        for name in names:
+            _add(one, name, rope.friction)
+    visual = add(link, 'visual', name='visual')
+    _add(visual, 'pose', [length / 2, 0, 0, 0, np.pi / 2, 0])
+    capsule = add(add(visual, 'geometry'), 'capsule')
+    _add(capsule, 'radius', rope.radius)
+    _add(capsule, 'length', length)
+    _add(add(visual, 'material'), 'diffuse', [0.9, 0.6, 0.2, 1])
 
 
 def _add_inertia(link: Any, rope: ExportedRope, segment: int) -> None:
@@ -147,8 +149,8 @@ def _about(rope: ExportedRope) -> list[str]:
         'Kept: EI / l and its damping as springs of the joints, mass, friction, radius, and the rest shape '
         'as spring_reference. The frames dlo_point_i are the points of the chain.',
         f'Not kept: EA = {measured(rope.stretching_stiffness, "N")}, the links are rigid; twist, which '
-        f'universal joints do not allow; drag, {measured(rope.drag, "1/s")}; resistance to rolling, which '
-        'DART does not have: a bent DLO can roll on a table.']
+        f'universal joints do not allow; drag, {measured(rope.drag, "1/s")}; the round cross-section: links '
+        'collide as boxes, as the physics engine DART has no friction against rolling.']
     if rope.bending_friction > 0:
         lines.append('Not kept: friction between the strands, bending_friction.')
     if not rope.slender:

@@ -64,7 +64,7 @@ def test_the_links_stand_as_the_chain():
     starts = np.array([one.position for one in poses(model)])
     assert starts == pytest.approx(chain.resample(np.linspace(0, chain.length, 13))[:-1], abs=5e-4)
     for one, other in zip(poses(model)[:-1], poses(model)[1:], strict=True):
-        assert one.points(np.array([numbers(model, 'link/collision/geometry/cylinder/length')[0], 0, 0])
+        assert one.points(np.array([numbers(model, 'link/collision/geometry/box/size')[0], 0, 0])
                           ) == pytest.approx(other.position)
 
 
