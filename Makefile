@@ -34,12 +34,12 @@ STAMP := $(VENV)/installed-with-ros-from-$(ROS)
 help:
 	@cat <<-END
 	  make demo    calibrate a sample session with the real node, and draw the result
-	  make test    run all tests
+	  make test    run the tests; some that take long are left to make soak
 	  make experiment   repeat the paper's experiment on the samples: consistency and validity, as tables;
 	               then execute plans with fitted, default and true parameters: what calibration is worth
 	  make lint    run the checks of style, types, imports and packaging alone
 	  make bench   measure speed, memory, start-up and accuracy, and compare the engines: about 25 minutes
-	  make soak    draw ten times as many random examples as make test; try hostile input and faults: up to an hour
+	  make soak    run long tests, draw many random examples, try hostile input and faults: an hour or more
 	  make figures make all tables of benchmark/results: make bench, and then some hours
 	  make clean   remove .venv and everything that was built
 	END

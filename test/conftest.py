@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator, Mapping
 import fcntl
+import gc
 from importlib.util import find_spec
 import json
 from pathlib import Path
@@ -36,6 +37,12 @@ FOLDERS = (NAME, 'config', 'launch', 'msg_samples', 'resource')  # of what is in
 def pytest_collection_modifyitems(items):
     """Begin with what takes longest, so that no process is left alone with it at the end."""
     items.sort(key=lambda item: item.name != 'test_mypy_finds_nothing')
+
+
+def pytest_collection_finish():
+    """Let the garbage collector pass over all that was imported, which stays to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -64,7 +64,8 @@ def trials_of(name):
     return trials
 
 
-@pytest.mark.parametrize('name', CHOICES)
+@pytest.mark.parametrize('name', [
+    pytest.param(name, marks=pytest.mark.long) if name == 'cma-es' else name for name in CHOICES])
 def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
     """It is killed in the search, in the examination, while it advises and while another engine confirms."""
     options, trials, whole = options_of(name), trials_of(name), Engines()
@@ -95,7 +96,8 @@ def unkilled(tmp_path_factory):
         return told(calibrate(toy_trials(2), options, make_simulator=whole, log=log)), whole.count
 
 
-@pytest.mark.parametrize('left', range(1, 60, 7))
+@pytest.mark.parametrize('left', [
+    *range(1, 60, 14), *(pytest.param(left, marks=pytest.mark.long) for left in range(8, 60, 14))])
 def test_what_comes_after_the_search_is_not_simulated_twice_either(left, unkilled, tmp_path):
     """Advice, missing parameters and confirmation are rollouts: each counts."""
     options, trials = options_of('least squares'), toy_trials(2)

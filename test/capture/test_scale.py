@@ -213,7 +213,7 @@ def test_a_table_seen_as_in_a_mirror_is_refused(places, change):
 
 
 @pytest.mark.parametrize('places', [CORNERS, SIX, EIGHT, BOARD], ids=['four', 'six', 'eight', 'board'])
-@pytest.mark.parametrize('one, other', [(1, 2), (3, 4)])
+@pytest.mark.parametrize('one, other', [(1, 2), pytest.param(3, 4, marks=pytest.mark.long)])
 def test_points_that_were_exchanged_are_named(places, one, other):
     camera = overhead(25.0)
     pixels = camera.to_pixels(on_table(places))

@@ -353,7 +353,8 @@ sys.exit(cli.main(sys.argv[3:], lambda options: ToySimulator(float(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize(('workers', 'seconds', 'code'), [(1, 0.01, 0), (2, 0.01, 0), (2, 600.0, 130)])
+@pytest.mark.parametrize(('workers', 'seconds', 'code'), [
+    pytest.param(1, 0.01, 0, marks=pytest.mark.long), (2, 0.01, 0), (2, 600.0, 130)])
 def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, seconds, code):
     evaluated = tmp_path / 'evaluated'
     process = subprocess.Popen(

@@ -254,7 +254,8 @@ def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, ma
     assert [one.name for one in (tmp_path / 'out').iterdir()] == ['calibrations.jsonl']
 
 
-@pytest.mark.parametrize(('workers', 'number'), [(1, signal.SIGINT), (2, signal.SIGTERM)])
+@pytest.mark.parametrize(('workers', 'number'), [
+    pytest.param(1, signal.SIGINT, marks=pytest.mark.long), (2, signal.SIGTERM)])
 def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
     process = started(session, tmp_path / 'out', workers)
     process.send_signal(number)

@@ -182,6 +182,7 @@ def test_the_last_worker_has_a_while_to_come_back(scheduler, start_worker, monke
     assert 'the scheduler lost the worker' in told[0]
 
 
+@pytest.mark.long
 def test_a_worker_that_comes_back_goes_on(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', PATIENCE)
     first = start_worker()

@@ -134,7 +134,7 @@ actions = st.one_of(
     hands().map(lambda hand: Action((hand,))))
 
 
-@drawing(25)
+@drawing(15)
 @given(initial=chains(), goal=chains(), several=st.lists(actions, min_size=1, max_size=3), name=texts,
        of_object=st.none() | texts, time=st.floats(0, 1e6), held_by=st.none() | st.lists(names, max_size=2),
        velocity=st.none() | st.tuples(numbers, numbers, numbers), mass=st.none() | st.floats(0, 1000))

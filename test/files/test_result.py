@@ -151,7 +151,7 @@ def test_a_result_that_should_not_be_used_says_so_wherever_it_is_read(tmp_path, 
     assert read_description(description_document(sound)).problems == ()
 
 
-@drawing(40)
+@drawing(20)
 @given(text=st.text(max_size=30), value=st.floats(0, 100), length=st.floats(1e-6, 1e6))
 def test_any_text_and_number_survives(tmp_path_factory, result, text, value, length):
     path = tmp_path_factory.mktemp('any') / 'result.xml'
@@ -269,7 +269,7 @@ def test_place_that_cannot_be_written_is_refused(tmp_path, result):
         write_result(tmp_path / 'missing' / 'result.xml', result)
 
 
-@drawing(40)
+@drawing(20)
 @given(place=st.floats(0, 1), octets=st.binary(max_size=6))
 def test_damaged_anywhere_is_read_or_refused(tmp_path_factory, result, place, octets):
     document = bytearray(description_document(result, OPTIONS.flat()))

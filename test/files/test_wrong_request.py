@@ -179,7 +179,8 @@ class FullDisk:
         return self._stream.write(octets)
 
 
-@pytest.mark.parametrize('room', [0, 1500, 3000, 12000])
+@pytest.mark.parametrize('room', [
+    0, 1500, 12000, *(pytest.param(room, marks=pytest.mark.long) for room in (100, 3000, 8000))])
 def test_full_disk_is_told_once_and_the_calibration_goes_on(ros_environment, tmp_path, monkeypatch, room):
     create = recording._create
 

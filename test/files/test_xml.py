@@ -158,14 +158,14 @@ def test_what_is_no_document_is_refused(octets):
     refused(octets)
 
 
-@drawing(150)
+@drawing(60)
 @given(octets=st.one_of(
     st.binary(max_size=200), st.text(alphabet='<>/!?[]&;#x0"\' =aA', max_size=80).map(str.encode)))
 def test_any_bytes_are_refused(octets):
     refused(octets)
 
 
-@drawing(150)
+@drawing(60)
 @given(place=st.floats(0, 1), octets=st.binary(max_size=6))
 def test_damaged_anywhere_is_read_or_refused(place, octets):
     document = bytearray(TEXT.encode())

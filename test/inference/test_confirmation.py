@@ -219,6 +219,7 @@ def command(capsys, tmp_path):
     return act
 
 
+@pytest.mark.long
 def test_fit_and_validate_tell_both_engines(command, tmp_path):
     fitted = command('fit', '--output', tmp_path / 'out')
     checked = command('validate')

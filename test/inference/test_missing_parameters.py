@@ -30,7 +30,8 @@ def candidates(space):
     return {name for name, *_ in _candidates(space)}
 
 
-@pytest.mark.parametrize('name, value', [('natural_curvature', 15.0), ('bending_friction', 45.0)])
+@pytest.mark.parametrize('name, value', [
+    ('natural_curvature', 15.0), pytest.param('bending_friction', 45.0, marks=pytest.mark.long)])
 def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
     assert result.missing_parameters[0].name == name
@@ -40,6 +41,7 @@ def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
     assert plain(result)['explanations'][name] == result.missing_parameters[0].share
 
 
+@pytest.mark.long
 def test_it_names_parts_of_different_stiffness():
     result = found(observed(EVEN.divided(4), STIFF_MIDDLE))
     assert result.missing_parameters[0].name == PARTS

@@ -95,7 +95,7 @@ def layouts(draw):
 
 
 @pytest.mark.parametrize('source', SOURCES)
-@drawing(50)
+@drawing(25)
 @given(layout=layouts(), seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9))
 def test_any_layout_is_read(source, layout, seed, count):
     types = SOURCES[source]()

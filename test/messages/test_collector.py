@@ -566,7 +566,7 @@ def feed(messages, options):
     return collector
 
 
-@drawing(80)
+@drawing(40)
 @given(session=sessions())
 def test_any_order_of_arrival_gives_the_same_trials(session):
     ordered, arrived, options = session
@@ -577,7 +577,7 @@ def test_any_order_of_arrival_gives_the_same_trials(session):
     assert list(map(str, one.problems)) == list(map(str, other.problems))
 
 
-@drawing(40)
+@drawing(20)
 @given(session=sessions(), again=st.data())
 def test_messages_sent_twice_change_nothing(session, again):
     ordered, arrived, options = session

@@ -225,7 +225,7 @@ def collected(messages):
     return collector
 
 
-@drawing(50)
+@drawing(25)
 @given(messages=st.lists(mutations('world'), min_size=1, max_size=6))
 def test_mutated_bytes_are_collected_or_refused(messages):
     collector = collected([
@@ -235,7 +235,7 @@ def test_mutated_bytes_are_collected_or_refused(messages):
         score_of(collector.trials)
 
 
-@drawing(50)
+@drawing(25)
 @given(data=st.data())
 def test_mutated_fields_are_collected_or_refused(data):
     originals = fuzzed_pairs(FILES, 'world')

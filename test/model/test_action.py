@@ -46,7 +46,7 @@ def test_the_turn_counts_from_where_the_hand_closed():
     assert hand.poses(1.0)[1][0] == pytest.approx(Rotation.from_euler('x', 30, degrees=True).as_matrix())
 
 
-@drawing(50)
+@drawing(30)
 @given(st.integers(0, 2**32 - 1), st.lists(st.booleans(), min_size=4, max_size=4), st.floats(0.6, 30))
 def test_sign_and_length_of_a_quaternion_do_not_matter(seed, flips, size):
     generator = np.random.default_rng(seed)

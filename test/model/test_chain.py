@@ -28,7 +28,7 @@ def chains(draw):
     return Chain(np.concatenate([[[0.5, -2, 1]], [[0.5, -2, 1]] + np.cumsum(steps, axis=0)]))
 
 
-@drawing(50, derandomize=True)
+@drawing(30, derandomize=True)
 @given(chains())
 def test_the_curve_passes_through_every_point_at_its_own_place(chain):
     places = chain.arc_lengths()
@@ -39,7 +39,7 @@ def test_the_curve_passes_through_every_point_at_its_own_place(chain):
     assert (np.diff(places) >= np.linalg.norm(np.diff(chain.points, axis=0), axis=1) - 1e-12).all()
 
 
-@drawing(50, derandomize=True)
+@drawing(30, derandomize=True)
 @given(chains(), st.floats(0, 1))
 def test_a_resampled_point_lies_as_far_along_as_was_asked(chain, share):
     at = share * chain.length
@@ -83,7 +83,7 @@ def test_beyond_its_ends_the_curve_stays_at_them():
     assert Chain(LINE).resample([-1.0, 7.0]) == pytest.approx(LINE[[0, -1]], abs=1e-12)
 
 
-@drawing(50, derandomize=True)
+@drawing(30, derandomize=True)
 @given(st.lists(st.floats(0.01, 2), min_size=2, max_size=12),
        st.lists(st.floats(0, 1), min_size=1, max_size=9), st.tuples(*[st.floats(-5, 5)] * 3))
 def test_a_parabola_is_reproduced_exactly(steps, shares, factors):
@@ -97,7 +97,7 @@ def test_a_parabola_is_reproduced_exactly(steps, shares, factors):
     assert np.abs(bezier_curve(knots, parabola(knots), at) - parabola(at)).max() < 1e-9 * size
 
 
-@drawing(50, derandomize=True)
+@drawing(30, derandomize=True)
 @given(chains(), st.integers(1, 40))
 def test_interpolation_matrix_gives_the_curve(chain, count):
     knots = chain.arc_lengths()

@@ -35,7 +35,7 @@ def test_crossings_are_counted_whatever_is_above_and_wherever_it_is_seen_from(po
     assert crossings(points + curve(0 * points[:, 0], 0.0, np.cos(50 * points[:, 0]))) == count
 
 
-@drawing(50)
+@drawing(30)
 @given(st.lists(st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=3, max_size=12, unique=True))
 def test_each_pair_of_segments_counts_as_the_signs_of_areas_tell(points):
     """Two segments cross if the ends of each are on different sides of the other."""

@@ -33,7 +33,7 @@ def one(answer):
     return bool(answer[0])
 
 
-@drawing(150)
+@drawing(60)
 @given(PLACES, PLACES, PLACES, PLACES)
 def test_a_way_enters_a_box_if_one_of_its_places_does(corner, other, begin, end):
     box = Box.between(np.concatenate([corner, other]))
@@ -48,7 +48,7 @@ def test_a_way_enters_a_box_if_one_of_its_places_does(corner, other, begin, end)
     assert entered == one(box.entered(end[None], begin[None]))
 
 
-@drawing(150)
+@drawing(60)
 @given(PLACES, PLACES, st.integers(0, 10), st.integers(1, 10))
 def test_a_way_keeps_to_an_annulus_if_all_its_places_do(begin, end, inner, width):
     ring = Annulus(np.array([0.1, -0.2]), inner / 10, (inner + width) / 10)
@@ -61,7 +61,7 @@ def test_a_way_keeps_to_an_annulus_if_all_its_places_do(begin, end, inner, width
         assert radii.min() < ring.inner + apart or radii.max() > ring.outer
 
 
-@drawing(50)
+@drawing(30)
 @given(st.lists(st.tuples(PLACES, PLACES), min_size=2, max_size=6), PLACES, PLACES)
 def test_many_ways_are_judged_as_each_alone(ways, corner, other):
     begin, end = (np.array(places) for places in zip(*ways, strict=True))

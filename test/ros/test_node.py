@@ -251,7 +251,8 @@ def test_unknown_parameter_is_refused_when_the_node_is_made(start_node):
         start_node(masss=1.0)
 
 
-@pytest.mark.parametrize(('number', 'workers'), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize(('number', 'workers'), [
+    (signal.SIGINT, 2), pytest.param(signal.SIGTERM, 1, marks=pytest.mark.long)])
 def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, number, workers):
     with child(ros_environment, tmp_path / 'out', '-p', f'workers:={workers}', '-p', 'evaluations:=10000',
                seconds=0.01) as process, robot_of(ros_environment) as robot:
@@ -270,7 +271,8 @@ def test_signal_while_it_calibrates_ends_cleanly(ros_environment, tmp_path, numb
 
 
 @pytest.mark.parametrize(('number', 'delay'), [
-    (signal.SIGINT, 0.5), (signal.SIGTERM, 0.9), (signal.SIGINT, 1.4), (signal.SIGTERM, 2.5)])
+    (signal.SIGINT, 0.5), (signal.SIGTERM, 0.9), (signal.SIGINT, 1.4),
+    pytest.param(signal.SIGTERM, 2.5, marks=pytest.mark.long)])
 def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_path, number, delay):
     marker = tmp_path / 'listening'
     program = (

@@ -67,6 +67,7 @@ def child(environment, *arguments):
         process.communicate()
 
 
+@pytest.mark.long
 def test_plans_of_the_real_search_bring_the_dlo_nearer_and_ctrl_c_ends_it_while_it_plans(ros_environment):
     options = ('-p', f'description:={RESULT}', '-p', 'actions:=1', '-p', 'draws:=0', '-p', 'workers:=1',
                '-p', 'tolerance:=0.01', '-p', 'simulation:=[nodes=15, time_step=0.006]')

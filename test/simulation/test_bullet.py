@@ -90,7 +90,8 @@ def dropped(height, goal_time=3.0, push=(0, 0, 0)):
 PHYSICAL = {**STIFF, 'flexibility': 1e-4, 'mass': 0.03, 'damping': 1.0}
 
 
-@pytest.mark.parametrize('radius', [0.003, 0.005, 0.01])
+@pytest.mark.parametrize('radius', [
+    0.003, *(pytest.param(one, marks=pytest.mark.long) for one in (0.005, 0.01))])
 def test_a_rope_laid_over_a_peg_hangs_over_it(scene, radius):
     simulator = BulletSimulator(scene=scene(PEG))
     found = simulator.simulate(dropped(0.36), {**PHYSICAL, 'self_collision': radius})

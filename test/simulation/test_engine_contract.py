@@ -6,6 +6,7 @@
 from contextlib import closing
 import functools
 import hashlib
+import itertools
 import json
 from pathlib import Path
 import pickle
@@ -23,6 +24,7 @@ from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 #: Each takes what `BulletSimulator` takes, but a scene.
 FACTORIES = (BulletSimulator, CompiledSimulator)
 
@@ -36,6 +38,16 @@ NEUTRAL = {parameter.name: parameter.default for parameter in PARAMETERS[7:]}  #
 MIDDLE = {**dict.fromkeys(SPACE.free, 50.0), 'natural_curvature': 20.0, 'flexibility': 60.0,
           'elasticity': 40.0, 'friction': 60.0, 'self_collision': 25.0, 'damping': 50.0,
           'internal_damping': 0.0, 'mass': 40.0}
+
+
+def each_engine(*names_and_values):
+    """Parametrize a test: names, their values for all engines, and values that take long with Bullet."""
+    *names, values, others = names_and_values
+    others = list(others)
+    return pytest.mark.parametrize(('make', *names), [
+        *((factory, *one) for one in values for factory in FACTORIES),
+        *((CompiledSimulator, *one) for one in others),
+        *(LONG(BulletSimulator, *one) for one in others)], indirect=['make'])
 
 
 @pytest.fixture(params=FACTORIES, ids=lambda factory: factory.name)
@@ -94,8 +106,8 @@ def elastica_tip(stiffness, load, length):
     return np.array([solution.y[2, -1], -solution.y[3, -1]])
 
 
-@pytest.mark.parametrize('stiffness', [0.5, 0.05, 0.005])
-@pytest.mark.parametrize('count', [12, 31])
+@each_engine('stiffness', 'count', itertools.product((0.05, 0.005), (12, 31)), itertools.chain(
+    itertools.product((0.5,), (12, 31)), itertools.product((0.5, 0.05, 0.005), (50,))))
 def test_cantilever_tip_is_the_elastica(make, stiffness, count):
     clamp = 0.01
     places = np.append(0.0, clamp + np.linspace(0, 1, count - 1))
@@ -108,7 +120,7 @@ def test_cantilever_tip_is_the_elastica(make, stiffness, count):
     assert abs(tip[1]) < 1e-9
 
 
-@pytest.mark.parametrize('stiffness', [5.0, 50.0, 5000.0])
+@each_engine('stiffness', [(50.0,)], [(5.0,), (5000.0,)])
 def test_hanging_rope_stretches_under_its_weight(make, stiffness):
     points = line((0, 0, 2), (0, 0, -1), 1.0, 31)
     stretch = 1.0 - settled(make, held(points, (0,)), {**STIFF, 'elasticity': stiffness}, 31)[-1, 2]
@@ -127,7 +139,7 @@ def test_limp_rope_hangs_in_a_catenary(make):
     assert -chain[:, 2].min() == pytest.approx(sag, rel=0.006)
 
 
-@pytest.mark.parametrize('friction', [0.1, 0.4, 1.0])
+@each_engine('friction', [(0.4,)], [(0.1,), (1.0,)])
 def test_pulling_a_rope_over_a_table_takes_its_friction(make, friction):
     stiffness = 20.0  # N, soft, so that its stretch is a measure of the force
     points = line((0, 0, 0.005), (1, 0, 0), 1.0, 31)
@@ -151,7 +163,7 @@ def test_a_rope_on_a_table_stays_where_friction_holds_it(make):
     assert np.abs(chain - points).max() < 2e-4
 
 
-@pytest.mark.parametrize('radius', [0.002, 0.015])
+@each_engine('radius', [(0.002,)], [(0.015,)])
 def test_legs_laid_across_each_other_do_not_pass_through(make, radius):
     # A loop: the last leg lies, 6 cm higher, across the first, and falls onto it while it is pulled.
     turn = np.linspace(-np.pi / 2, np.pi, 40)
@@ -321,11 +333,11 @@ def chains_of(factory, **changed):
 
 
 def tried_parameters():
-    """List engines and parameters; of those that differ in a number only, Bullet gets the first."""
+    """Give engines and parameters; of those that differ in a number only, the first is enough for Bullet."""
     for parameter in PARAMETERS:
         yield CompiledSimulator, parameter.name
-        if not re.search('[3-9]$', parameter.name) and not re.search('x2|y2', parameter.name):
-            yield BulletSimulator, parameter.name
+        several = re.search('[3-9]$|[xy]2$', parameter.name)
+        yield LONG(BulletSimulator, parameter.name) if several else (BulletSimulator, parameter.name)
 
 
 @pytest.mark.parametrize(('factory', 'name'), list(tried_parameters()))
@@ -390,7 +402,7 @@ def test_a_rollout_that_diverges_ends_as_a_simulation_error_and_the_next_one_is_
     assert rollout(engine).chains.tobytes() == whole.chains.tobytes()
 
 
-@pytest.mark.parametrize('noise', [0.0, 0.001])
+@each_engine('noise', [(0.001,)], [(0.0,)])
 def test_a_radius_that_is_not_the_measured_height_neither_kicks_nor_floats(make, noise):
     simulator = make()
     trial = drag_trial(height=0.008, noise=noise)

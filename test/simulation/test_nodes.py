@@ -28,7 +28,7 @@ def trial(points, grips=((0,),), goals=None, velocity=None):
     return Trial('t', Chain(points), (Action(hands),), goals, velocity)
 
 
-@drawing(100)
+@drawing(50)
 @given(st.lists(st.floats(0.001, 1.0), min_size=1, max_size=8), st.integers(0, 60))
 def test_places_contain_the_fixed_ones_and_are_as_even_as_these_allow(widths, more):
     fixed = np.concatenate([[0.0], np.cumsum(widths)])
@@ -43,7 +43,7 @@ def test_places_contain_the_fixed_ones_and_are_as_even_as_these_allow(widths, mo
     assert fewest > count - 1
 
 
-@drawing(50)
+@drawing(30)
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=10, unique=True), st.integers(12, 60))
 def test_every_gripped_point_has_a_node_of_its_own(grips, count):
     layout = NodeLayout.of(trial(arc(), (tuple(grips),)), count)
@@ -55,7 +55,7 @@ def test_every_gripped_point_has_a_node_of_its_own(grips, count):
     assert layout.points[list(nodes)] == pytest.approx(arc()[grips], abs=1e-9)
 
 
-@drawing(50)
+@drawing(30)
 @given(st.integers(0, 18), st.integers(12, 80))
 def test_a_clamp_that_holds_from_the_start_has_no_node_within(first, count):
     one = trial(arc(), ((first, first + 1),))
@@ -133,7 +133,7 @@ def test_a_layout_is_read_only():
             array[0] = 1
 
 
-@drawing(50)
+@drawing(30)
 @given(st.integers(0, 2**32 - 1), st.floats(-2, 2), st.floats(0.002, 0.03))
 def test_a_resting_chain_shows_its_level_through_noise(seed, table, radius):
     noise = np.random.default_rng(seed).normal(0, 0.001, (21, 3))

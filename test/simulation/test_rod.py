@@ -84,7 +84,7 @@ def test_free_fall():
     assert velocities == pytest.approx(np.tile((0.3, -0.2, 0.1 - 9.81 * 0.2), (11, 1)), abs=1e-9)
 
 
-@drawing(30, derandomize=True)
+@drawing(20, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.1))
 def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
     generator = np.random.default_rng(seed)
@@ -99,7 +99,7 @@ def test_momentum_is_conserved_without_gravity_and_drag(seed, internal_damping):
     assert rod.state.masses @ velocities == pytest.approx(before, abs=1e-10)
 
 
-@drawing(30, derandomize=True)
+@drawing(20, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-5, 0.1), st.floats(10, 1e4),
        st.sampled_from([0.001, 0.005, 0.02]))
 def test_energy_never_grows(seed, bending, stretching, step):

@@ -84,7 +84,7 @@ def test_a_hand_holds_from_its_first_waypoint_to_its_last():
     assert chains[:, 0] == pytest.approx(np.zeros((6, 3)), abs=1e-9)
 
 
-@drawing(50)
+@drawing(25)
 @given(st.lists(st.integers(0, 20000), min_size=1, max_size=8, unique=True))
 def test_timed_goals_are_seen_at_their_instant_between_steps(instants):
     times = sorted(instant * 1e-4 for instant in instants)
