@@ -58,7 +58,7 @@ test: export OPENCV_FOR_THREADS_NUM := 1
 test: $(STAMP)
 	@cores=$$(nproc)
 	$(PYTHON) -m dlo_calibration warm-up  # once for all processes of the tests
-	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10
+	$(PYTHON) -m pytest --numprocesses $$((cores < 4 ? cores + 1 : 4)) --dist worksteal --durations 10 $(ARGUMENTS)
 
 lint: $(STAMP)
 	@$(PYTHON) -m pytest $(LINT)
