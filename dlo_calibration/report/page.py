@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
 import platform
 import shlex
-from typing import Any, Callable, Iterable, Mapping, Sequence
+from typing import Any, Callable, Iterable, Mapping, Sequence, TYPE_CHECKING
 
 from dlo_calibration.calibration.file_options import recordable
 from dlo_calibration.calibration.options import declarations, Options
@@ -30,6 +31,9 @@ from dlo_calibration.report.landscape import convergence_panel, line_panels, pla
 from dlo_calibration.report.rows import fit_facts, parameter_rows
 from dlo_calibration.report.sentences import lower_score, MEAN_DISTANCE, sentences, verdict
 from dlo_calibration.writing import whole
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 MOST_TRIALS = 12  # are drawn, so that the page stays small
 MOST_CORRELATIONS = 12  # parameters of a table of all; of more, as many pairs are listed
@@ -83,22 +87,14 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
         thread of its own, while this one draws the other pictures.
     :raises InputError: if the file cannot be written.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     with ThreadPoolExecutor(1) as thread:
         pending = thread.submit(simulate_slices)
         drawn = {'rest_shapes': rest_shape_panels(result), 'moments': moment_panels(result),
                  'convergence': convergence_panel(result), **_trials(result)}
         slices = pending.result()
 
-    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
-                              autoescape=True, trim_blocks=True, lstrip_blocks=True,
-                              keep_trailing_newline=True,
-                              finalize=lambda value: printable(value) if type(value) is str else value)
-    environment.filters.update(number=number, exact=exact, squared=lambda text: text.replace('m^2', 'm²'))
-    environment.globals.update(measured=measured)
     values = plain(result)
-    page = environment.get_template('page.html').render(
+    page = _template().render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
         verdict=verdict(result),
         rows=parameter_rows(values['parameters'], result.space),
@@ -115,6 +111,20 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
         declarations=list(declarations()))
     with whole(path) as new:
         new.write_text(page, encoding='utf-8')
+
+
+@cache
+def _template() -> Template:
+    """Return the template, which takes a tenth of a second to compile."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
+                              autoescape=True, trim_blocks=True, lstrip_blocks=True,
+                              keep_trailing_newline=True,
+                              finalize=lambda value: printable(value) if type(value) is str else value)
+    environment.filters.update(number=number, exact=exact, squared=lambda text: text.replace('m^2', 'm²'))
+    environment.globals.update(measured=measured)
+    return environment.get_template('page.html')
 
 
 def most_correlated(correlations: Mapping[str, Mapping[str, float]] | None) -> list[tuple[str, str, float]]:
