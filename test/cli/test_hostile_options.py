@@ -143,7 +143,8 @@ def test_no_file_of_ours_records_the_machine(tmp_path):
     for file in (result_file(tmp_path, chosen), request_file(tmp_path, chosen)):
         text = file.read_text(encoding='utf-8')
         assert 'name="seed"' in text and not any(f'name="{name}"' in text for name in OF_THE_MACHINE)
-    assert read_result(tmp_path / 'result.xml').problems == ()
+    found = read_result(tmp_path / 'result.xml')
+    assert found.problems == (f'do not use this result: {found.unusable}',)  # and nothing about options
 
 
 # ---- scenes
