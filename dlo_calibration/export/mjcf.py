@@ -37,7 +37,7 @@ TIME_STEP = 0.002  # s
 #: Friction against turning about the normal and against rolling, relative to that of sliding and the radius.
 #: The DLO is to slide, as in the calibration.  In the elliptic cone, a ratio c of rolling leaves sliding
 #: ``1 / sqrt(1 + 1 / c^2)`` of its friction.
-TURNING, ROLLING = 0.01, 10.0
+TURNING, ROLLING = 0.01, 4.0
 LEAST_DAMPING = 0.6  # time steps, of the damping relative to the stiffness
 
 
