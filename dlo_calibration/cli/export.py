@@ -49,6 +49,8 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         raise InputError('--form', repr(chosen.form), one_of(forms, chosen.form) if forms else
                          f'no form: {chosen.format} has only one', 'correct it')
     found = read_result(chosen.result)
+    for text in found.problems:
+        tell(text)
     known = {name: value for name, value in found.file_options.values.items() if name in USED}
     options = Options.of({**known, **given_options(chosen)})
     text = export(found, read_chain_file(chosen.start), options=options,
