@@ -35,7 +35,7 @@ ONLY = {
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
     'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py', 'simulation/window.py'),
-    'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
+    'dlo_calibration.simulation.compiled': ('calibration/engines.py', 'simulation/together.py'),
 }
 
 NOT_LOADED = ('aiohttp', 'cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib',
