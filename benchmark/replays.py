@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Replays: compares another simulator with our engine and with the measurement, and with the elastica."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Callable, Iterator, Sequence
+
+from accuracy import convert, fit
+from figures import table
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_bvp
+
+from dlo_calibration import read_result, read_session, Trial
+from dlo_calibration.model.parameters import GRAVITY
+from dlo_calibration.simulation.compiled import CompiledSimulator
+
+Floats = NDArray[np.float64]
+OBJECTS = tuple(f'object{k}' for k in range(1, 6))
+SETTLING = 4.0  # s after the last motion of a hand
+LENGTH, MASS = 0.6, 0.03  # m, kg, of the cantilevers
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A point of the chain that a hand holds, and its (k,) times [s] and (k, 3) positions [m]."""
+
+    point: int
+    times: Floats
+    positions: Floats
+
+
+#: Simulates a calibrated DLO from the start of a trial; returns its points, (n, 3) [m], at a time [s].
+Replay = Callable[[Any, Trial, list[Grip], float], Floats]
+
+
+def grips(trial: Trial, until: float) -> list[Grip]:
+    """Return the grips of a trial; those that still hold at the goal hold to the end, [s]."""
+    found = []
+    for hand in trial.hands:
+        times, positions = np.array(hand.times), np.array(hand.positions)
+        if trial.holds(hand, trial.goals[-1]):
+            times, positions = np.append(times, until + 1), np.vstack([positions, positions[-1:]])
+        start = positions[0] - trial.initial.points[list(hand.grips)].mean(axis=0) * (len(hand.grips) > 1)
+        for grip in hand.grips:
+            apart = trial.initial.points[grip] + start - positions[0] if len(hand.grips) > 1 else 0.0
+            found.append(Grip(grip, times, positions + apart))
+    return found
+
+
+def compared(folder: Path, replay: Replay, most: int, names: Sequence[str] = OBJECTS) -> str:
+    """
+    Return a table of objects, fitted on four trials each, in at most so many other trials each.
+
+    :param folder: for results; one that is there already is used.
+    """
+    rows = []
+    for name in names:
+        if not (folder / name / 'result.xml').exists():
+            fit(convert('reference', name, folder / f'{name}_session'), folder / name)
+        found = read_result(folder / name / 'result.xml')
+        if not (folder / f'{name}_other').exists():
+            convert('reference', name, folder / f'{name}_other', '--actions', 'other')
+        values = {key: one.value for key, one in found.parameters.items()}
+        simulator = CompiledSimulator()
+        away: list[list[float]] = [[], [], []]
+        for trial in read_session(folder / f'{name}_other').trials[:most]:
+            end = max(trial.goals[-1].time, max(hand.end for hand in trial.hands) + SETTLING)
+            ours = simulator.simulate(trial, found.space.physical(values, trial.initial.length)).chains[-1]
+            theirs = replay(found, trial, grips(trial, end), end)
+            measured = trial.goals[-1].chain.points
+            for to, one, other in zip(away, (theirs, theirs, ours), (ours, measured, measured), strict=True):
+                to.append(1e3 * float(np.linalg.norm(one - other, axis=1).mean()))
+            print(name, trial.name, *(f'{one[-1]:.2f}' for one in away), flush=True)
+        rows.append([name[-1], *(f'{np.mean(one):.2f}' for one in away), f'{max(away[0]):.2f}',
+                     f'{np.mean(away[1]) / np.mean(away[2]):.2f}'])
+    return table(['object', 'from our engine, mm', 'from the measurement, mm',
+                  'our engine from the measurement, mm', 'worst trial from our engine, mm',
+                  'times our error'], rows)
+
+
+def cantilevers(tip: Callable[[float, int], Floats], cases: Iterator[tuple[float, int]], clamp: float) -> str:
+    """
+    Return a table of cantilevers at rest.
+
+    :param tip: returns the tip, (3,) [m], of a DLO with EI [N m^2] in so many segments, held by the first.
+    :param clamp: share of the first segment that does not bend.
+    """
+    rows = []
+    for stiffness, segments in cases:
+        away = np.linalg.norm(tip(stiffness, segments) - elastica(stiffness, clamp * LENGTH / segments))
+        rows.append([f'{stiffness:g}', segments, f'{1e3 * away:.2f}', f'{100 * away / LENGTH:.3f}'])
+        print(*rows[-1], flush=True)
+    return table(['EI, N m²', 'segments', 'tip from the elastica, mm', '% of the length'], rows)
+
+
+def elastica(stiffness: float, clamp: float) -> Floats:
+    """Return the tip of a horizontal cantilever under its weight, (3,) [m] from where it is clamped."""
+    free, load = LENGTH - clamp, MASS / LENGTH * GRAVITY
+    s = np.linspace(0, free, 400)
+    shape = np.stack([0 * s, 0 * s, clamp + s, 0 * s])
+    for share in np.geomspace(1e-3, 1, 30):  # from an almost weightless one: a limp one needs a good start
+        def slope(at: Floats, y: Floats, load: float = share * load) -> Floats:
+            return np.stack([y[1], load * (free - at) * np.cos(y[0]) / stiffness, np.cos(y[0]), np.sin(y[0])])
+
+        solved = solve_bvp(slope, lambda a, b: np.array([a[0], b[1], a[2] - clamp, a[3]]), s, shape, tol=1e-6,
+                           max_nodes=50000)
+        if not solved.success:
+            raise RuntimeError(solved.message)
+        s, shape = solved.x, solved.y
+    return np.array([shape[2, -1], 0.0, shape[3, -1]])
