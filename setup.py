@@ -42,6 +42,7 @@ setup(
     install_requires=[
         'aiohttp>=3.9',
         'Jinja2>=3.1',
+        'llvmlite>=0.41',
         'lxml>=5.2',
         'lz4>=4.0',
         'matplotlib>=3.6',

@@ -26,6 +26,7 @@ EXECUTABLES = ('calibrator', 'dlo-calibration')
 ROSDEP_KEYS = {
     'PIL': 'python3-pil',
     'cv2': 'python3-opencv',
+    'llvmlite': 'python3-numba',  # Numba needs it
     'ruamel': 'python3-ruamel.yaml',
 }
 

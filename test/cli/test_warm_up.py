@@ -15,16 +15,18 @@ def test_a_second_time_it_is_all_there(command):
     for _ in range(2):
         code, found, _ = command('warm-up', '--json')
         assert code == 0
-        assert [one['name'] for one in found['compiled']] == ['simulation', 'tracer']
+        assert [one['name'] for one in found['compiled']] == [
+            'simulation', 'simulation of several trials at once', 'tracer']
         assert all(list(Path(one['folder']).glob('*.nbi')) for one in found['compiled'])
     assert not any(one['compiled'] for one in found['compiled'])
 
 
 def test_a_verb_tells_that_it_compiles_before_it_does(monkeypatch, capsys):
     done = []
-    monkeypatch.setattr(main, 'is_compiled', lambda module: bool(done))
-    monkeypatch.setattr(main, 'compile_kernels', lambda module: done.append(capsys.readouterr().err))
+    monkeypatch.setattr(main, 'is_compiled', lambda module: module in dict(done))
+    monkeypatch.setattr(main, 'compile_kernels', lambda module: done.append((module, capsys.readouterr().err)))
     for _ in range(2):
         main.make_told(Options()).close()
-    told, = done
-    assert told == 'compiling the simulation for this machine, once, about half a minute\n'
+    assert [told for _, told in done] == [
+        f'compiling the {what} for this machine, once, about half a minute\n'
+        for what in ('simulation', 'simulation of several trials at once')]
