@@ -27,6 +27,7 @@ def test_ruff_finds_nothing():
     assert not found, found
 
 
+@pytest.mark.long  # make lint and continuous integration execute it
 @pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < '2.0.0', reason='types of numpy 1 are less exact')
 def test_mypy_finds_nothing():
     found = findings('mypy')

@@ -25,7 +25,7 @@ import pytest
 from dlo_calibration.capture import information
 from dlo_calibration.simulation.compiled import CompiledSimulator
 
-pytestmark = pytest.mark.usefixtures('without_drawings')
+pytestmark = [pytest.mark.usefixtures('without_drawings'), pytest.mark.long]
 
 PATIENCE = 30  # s
 TURN = np.linspace(0.0, 1.0, 300)
