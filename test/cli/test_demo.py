@@ -35,6 +35,7 @@ def on_one_cpu():
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
+@pytest.mark.long
 def test_demo_ends_with_a_table_a_result_and_a_picture(ros_environment, tmp_path):
     sample = write_session(tmp_path / 'sample', session_messages(bag_types(), 1), {
         'calibrate': ['flexibility', 'damping'], 'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.2})

@@ -27,6 +27,7 @@ def example(environment, name, *words):
     return done.stderr + done.stdout
 
 
+@pytest.mark.long
 def test_robot_session_sends_trials_starts_and_hears_the_result(ros_environment, tmp_path):
     with child(ros_environment, tmp_path / 'out', '-p', 'evaluations:=5', '-p', 'workers:=1') as process:
         heard = example(ros_environment, 'robot_session.py')
@@ -41,6 +42,7 @@ def test_robot_session_sends_trials_starts_and_hears_the_result(ros_environment,
     assert len(read_session(folder).trials) == 4
 
 
+@pytest.mark.long
 def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environment):
     planner = subprocess.Popen(
         [sys.executable, '-m', 'dlo_calibration.ros.planner', '--ros-args', '-p', 'workers:=1',

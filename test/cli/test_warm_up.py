@@ -24,7 +24,8 @@ def test_a_second_time_it_is_all_there(command):
 def test_a_verb_tells_that_it_compiles_before_it_does(monkeypatch, capsys):
     done = []
     monkeypatch.setattr(main, 'is_compiled', lambda module: module in dict(done))
-    monkeypatch.setattr(main, 'compile_kernels', lambda module: done.append((module, capsys.readouterr().err)))
+    monkeypatch.setattr(main, 'compile_kernels',
+                        lambda module: done.append((module, capsys.readouterr().err)))
     for _ in range(2):
         main.make_told(Options()).close()
     assert [told for _, told in done] == [

@@ -257,6 +257,7 @@ def needed(document: str, width: int) -> tuple[int, int]:
     return int(across), int(down)
 
 
+@pytest.mark.long
 def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path):
     frame, shot = tmp_path / 'frame.html', tmp_path / 'shot.png'
     frame.write_text(framed(drawn, dict.fromkeys(WIDTHS, 1000)), encoding='utf-8')

@@ -81,6 +81,7 @@ def test_photographs_come_from_topics_with_the_lens_of_their_camera(ros_environm
         assert 'no such topic' in page.refused('POST', 'api/topics', {'name': '/nothing'})[1]
 
 
+@pytest.mark.long
 def test_trials_are_sent_to_a_calibrator_in_another_process(ros_environment, tmp_path):
     from graph import child
 
