@@ -16,6 +16,7 @@ from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import InputError, one_of
 from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
+from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.export.usd import FORMS as USD_FORMS
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
@@ -53,9 +54,11 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         tell(text)
     known = {name: value for name, value in found.file_options.values.items() if name in USED}
     options = Options.of({**known, **given_options(chosen)})
-    text = export(found, read_chain_file(chosen.start), options=options,
-                  **({} if chosen.form is None else {'form': chosen.form}))
+    chain = read_chain_file(chosen.start)
+    text = export(found, chain, options=options, **({} if chosen.form is None else {'form': chosen.form}))
     with whole(chosen.output) as new:
         new.write_text(text, encoding='utf-8')
+    for remark in ExportedRope.of(found, chain, options).remarks:
+        tell(remark)
     tell(f'the DLO is in {chosen.output}')
     return 0

@@ -3,6 +3,7 @@
 
 """The verb `export`: which file it writes, and what it refuses."""
 
+import numpy as np
 import pytest
 
 from dlo_calibration.cli import main as cli
@@ -17,10 +18,10 @@ ROPE, START = samples() / 'xml/dlo.xml', samples() / 'chains/start.csv'
 @pytest.fixture
 def export(capsys, tmp_path):
     """Give a function that exports the sample; it returns exit code, stderr, and the file."""
-    def export(*words, result=ROPE):
+    def export(*words, result=ROPE, start=START):
         file = tmp_path / 'rope.out'
         try:
-            code = cli.main(['export', str(result), '--from', str(START), '--output', str(file), *words])
+            code = cli.main(['export', str(result), '--from', str(start), '--output', str(file), *words])
         except SystemExit as end:  # argparse
             code = end.code
         return code, capsys.readouterr().err, file
@@ -41,6 +42,14 @@ def test_it_takes_a_form_and_options(export):
     text = file.read_text()
     assert 'type="slide"' not in text and 'type="plane"' not in text
     assert 'name="dlo_9"' in text and 'name="dlo_10"' not in text
+
+
+def test_it_tells_what_is_doubtful_or_not_known(export, tmp_path):
+    in_millimetres = tmp_path / 'start.csv'
+    np.savetxt(in_millimetres, 1000 * read_chain_file(START).points, delimiter=',')
+    code, told, _ = export('--format', 'sdf', start=in_millimetres)
+    assert code == 0
+    assert 'check that both are the same DLO' in told and 'elasticity is not identifiable' in told
 
 
 @pytest.mark.parametrize('words, said', [
