@@ -6,8 +6,8 @@ Kernels: the physics of a DLO, compiled by Numba.
 
 They compute the rod's internal forces with natural curvature and twist, contact of the DLO
 with itself, and a table with friction.  Numba's cache keeps the machine code, so that it is
-compiled once per machine.  All kernels are in one file because the cache notices only
-changes of the file that a kernel is in, not of the kernels that it calls.
+compiled once per machine.  Numba notices only changes of the file that a kernel is in, not of the
+kernels that it calls: `kernel_cache` knows which other files they depend on.
 """
 
 from __future__ import annotations
