@@ -26,7 +26,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.protocol import TogetherSimulator
 
-TOGETHER = 8  # rollouts at a time: two for each lane, so that lanes are seldom empty towards the end
+AT_A_TIME = 8  # rollouts: two for each lane, so that lanes are seldom empty towards the end
 
 
 class BatchEvaluator:
@@ -84,7 +84,7 @@ class BatchEvaluator:
         """Return how many of so many points to evaluate at a time."""
         if not isinstance(self.evaluator.simulator, TogetherSimulator):
             return 1
-        wanted = math.ceil(TOGETHER / len(self.evaluator.trials))
+        wanted = math.ceil(AT_A_TIME / len(self.evaluator.trials))
         return max(1, min(wanted, points // getattr(self._executor, 'workers', 1)))
 
     def _in_parallel(self, points: Floats, first: int, executor: Executor) -> Iterator[Evaluation]:

@@ -48,17 +48,17 @@ class Lanes:
             kept=room(friction.kept), pull=room(friction.pull), numbers=_aligned(6, COUNT),
             lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
             begun=np.ones(1, np.int64))
-        self._ropes: list[Traveller] = []
+        self._ropes: list[RolloutUnderWay] = []
 
-    def let_in(self, travellers: Sequence[Traveller]) -> None:
+    def let_in(self, rollouts: Sequence[RolloutUnderWay]) -> None:
         """Give these, at most `COUNT`, and no others, a lane each."""
-        places: list[Traveller | None] = [None] * len(travellers)
+        places: list[RolloutUnderWay | None] = [None] * len(rollouts)
         for lane, one in enumerate(self._ropes):
-            if one.inside and one in travellers and lane < len(travellers):
+            if one.inside and one in rollouts and lane < len(rollouts):
                 places[lane] = one
             elif one.inside:
                 self.let_out(one)
-        coming = iter([one for one in travellers if one not in places])
+        coming = iter([one for one in rollouts if one not in places])
         for lane, place in enumerate(places):
             if place is None:
                 place = places[lane] = next(coming)
@@ -66,7 +66,7 @@ class Lanes:
                 place.inside = True
         self._ropes = [one for one in places if one is not None]
 
-    def let_out(self, one: Traveller) -> None:
+    def let_out(self, one: RolloutUnderWay) -> None:
         """Give a rope its state back."""
         kernels_together.leave(one.rope.state, self.state, self._ropes.index(one))
         one.inside = False
@@ -79,11 +79,11 @@ class Lanes:
         advanced()
 
 
-class Traveller:
+class RolloutUnderWay:
     """
-    A rope on the course of its trial.
+    A rollout that is under way: a rope, and the course of its trial.
 
-    :param number: of the rollout.
+    :param number: its place among the rollouts that were asked for.
     """
 
     def __init__(self, number: int, rope: CompiledRope, course: Course) -> None:
@@ -91,7 +91,7 @@ class Traveller:
         self.inside = False  # whether its state is in a lane
         self.kind: Hashable = None
         self.outcome: Rollout | SimulationError | None = None
-        self._go_on(None)
+        self._take_next(None)
 
     @property
     def left(self) -> int:
@@ -103,14 +103,15 @@ class Traveller:
         """Whether its move has ended."""
         return self.left == 0 or self.move.progress[3] != kernels_together.GOES_ON
 
-    def turn(self) -> None:
+    def go_on(self) -> None:
         """Go on after a move."""
         if self.move.progress[3] == kernels_together.DIVERGED:
             self.outcome = diverged()
         else:
-            self._go_on((int(self.move.progress[0]), bool(self.move.progress[3] == kernels_together.STABLE)))
+            stable = bool(self.move.progress[3] == kernels_together.STABLE)
+            self._take_next((int(self.move.progress[0]), stable))
 
-    def _go_on(self, taken: tuple[int, bool] | None) -> None:
+    def _take_next(self, taken: tuple[int, bool] | None) -> None:
         """Find the next steps that can be taken together with others; take those that cannot."""
         try:
             while True:
@@ -163,25 +164,25 @@ def roll_out_together(starts: Iterable[Callable[[], tuple[CompiledRope, Course]]
     """
     waiting = deque(enumerate(starts))
     found: list[Rollout | SimulationError | None] = [None] * len(waiting)
-    travellers: list[Traveller] = []
+    rollouts: list[RolloutUnderWay] = []
     rooms: dict[Hashable, Lanes] = {}
     kind: Hashable = None
-    while waiting or travellers:
+    while waiting or rollouts:
         between()
-        while waiting and len(travellers) < 2 * COUNT:
+        while waiting and len(rollouts) < 2 * COUNT:
             number, start = waiting.popleft()
-            travellers.append(Traveller(number, *start()))
-        for one in [one for one in travellers if one.outcome is not None]:
+            rollouts.append(RolloutUnderWay(number, *start()))
+        for one in [one for one in rollouts if one.outcome is not None]:
             found[one.number] = one.outcome
-            travellers.remove(one)
-        if not travellers:
+            rollouts.remove(one)
+        if not rollouts:
             continue
-        counts = Counter(one.kind for one in travellers)
+        counts = Counter(one.kind for one in rollouts)
         if counts[kind] < min(COUNT, max(counts.values())):
             if kind in rooms:
                 rooms[kind].let_in([])
             kind = counts.most_common(1)[0][0]
-        going = sorted((one for one in travellers if one.kind == kind), key=lambda one: not one.inside)
+        going = sorted((one for one in rollouts if one.kind == kind), key=lambda one: not one.inside)
         going = going[:COUNT]
         if kind not in rooms:
             rooms[kind] = Lanes(going[0].rope)
@@ -191,7 +192,7 @@ def roll_out_together(starts: Iterable[Callable[[], tuple[CompiledRope, Course]]
         for one in going:
             if one.arrived:
                 lanes.let_out(one)
-                one.turn()
+                one.go_on()
     return [one for one in found if one is not None]
 
 
