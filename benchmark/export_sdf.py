@@ -127,8 +127,6 @@ The reference objects, fitted on four trials each, in one other trial each on th
 {NODES - 1} links. The hands are springs. The found drag is applied as a force, which SDF does not have.
 
 {second}
-
-With cylinders instead of boxes, object 2 was 43 mm from our engine in the first trial: it rolled.
 """
     print(text)
     (HERE / 'results' / 'export_sdf.md').write_text(text)
