@@ -79,6 +79,7 @@ class CalibratorNode(GraphNode[Options]):
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-MARGIN)),
             post_callback=self._on_jump)
+        self.serve_parameters()
         self.info('collecting trials; call ~/start to calibrate')
 
     def end(self) -> None:

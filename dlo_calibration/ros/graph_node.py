@@ -19,6 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.parameter_service import ParameterService
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -100,7 +101,7 @@ class GraphNode(OptionsNode[Chosen]):
     """
 
     def __init__(self, name: str, kind: type[Chosen], inputs: Mapping[str, str], **arguments: Any) -> None:
-        super().__init__(name, kind, **arguments)
+        super().__init__(name, kind, start_parameter_services=False, **arguments)
         self._notices = _Notices(self.warn)
         LOG.addHandler(self._notices)
         self.types = rclpy_types()
@@ -154,6 +155,10 @@ class GraphNode(OptionsNode[Chosen]):
         """Create the publisher of an output topic, of a type such as ``std_msgs/msg/String``."""
         self._outputs[name] = self.create_publisher(self.types.find(kind), f'~/{name}',
                                                     LATCHED if latched else QoSProfile(depth=10))
+
+    def serve_parameters(self) -> None:
+        """Offer the services of the parameters: at last, as nobody answers them while the node is made."""
+        ParameterService(self)  # its callbacks keep it
 
     def subscribe(self, *kinds: str) -> None:
         """Subscribe to input topics."""

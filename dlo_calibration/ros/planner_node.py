@@ -73,6 +73,7 @@ class PlannerNode(GraphNode[PlannerOptions]):
             if options.mode != PUBLISH:
                 self._begin(make_simulator, session or {})
             self._serve_description()
+            self.serve_parameters()
         except BaseException:
             self.close()
             raise
