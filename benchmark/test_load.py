@@ -15,9 +15,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from dlo_calibration.cli import conversation
+from rclpy.clock import Clock, ClockType  # noqa: E402 - where there is a ROS
+
+from dlo_calibration.cli import conversation  # noqa: E402
 from dlo_calibration.files.session import read_session  # noqa: E402
-from dlo_calibration.ros import calibrator_node  # noqa: E402 - where there is a ROS
+from dlo_calibration.ros import calibrator_node  # noqa: E402
 from dlo_calibration.signals import StopFlag  # noqa: E402
 
 SAMPLE = Path(__file__).resolve().parent.parent / 'msg_samples' / 'object1'
@@ -33,7 +35,7 @@ class Watched(calibrator_node.CalibratorNode):
 
     def __init__(self, *args, **keywords):
         super().__init__(*args, **keywords)
-        clock = calibrator_node.Clock(clock_type=calibrator_node.ClockType.STEADY_TIME)
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, lambda: self.fired.append(time.monotonic()), clock=clock)
 
 
