@@ -32,3 +32,14 @@ def test_ruff_finds_nothing():
 def test_mypy_finds_nothing():
     found = findings('mypy')
     assert not found, found
+
+
+@pytest.mark.long
+def test_benchmarks_and_examples_use_only_what_the_package_has():
+    """They run for too long to be tests; without this, they break when something they use moves."""
+    scripts = [str(path) for pattern in ('benchmark/*.py', 'examples/*.py') for path in ROOT.glob(pattern)]
+    found = findings('mypy', '--config-file=', '--check-untyped-defs', '--ignore-missing-imports',
+                     '--follow-imports=silent', '--hide-error-context', *scripts)
+    wrong = [line for line in found.splitlines()
+             if line.endswith(('[attr-defined]', '[call-arg]', '[name-defined]', '[syntax]'))]
+    assert not wrong, '\n'.join(wrong)
