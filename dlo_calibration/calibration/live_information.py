@@ -136,6 +136,7 @@ class LiveInformation:
             return
         trials = with_shared_places(trials)
         start, default = prior(trials, options).hints.start, space.default_point()
+        guessed = tuple(name for name, one in zip(space.free, start, strict=True) if np.isnan(one))
         known, kept = Knowledge.before(space.free, np.where(np.isnan(start), default, start)), []
         if result is not None and done and examination is not None:
             known = Knowledge(known.names, result.best.point, examination.uncertainty)
@@ -150,7 +151,7 @@ class LiveInformation:
                 elif fresh:
                     try:
                         informations[key] = _result(job, process.submit(_appraised, Appraiser(
-                            space, simulator, mean_length(trials), height, noise(trials)), known,
+                            space, simulator, mean_length(trials), height, noise(trials), guessed), known,
                             [*kept, trial]))
                     except CancelledError:
                         raise

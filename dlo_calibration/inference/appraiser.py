@@ -26,6 +26,7 @@ from dlo_calibration.inference.advice import sensitivity
 from dlo_calibration.inference.examination import extended
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
+    NOT_IDENTIFIABLE,
     optimum_shift,
     prior_information,
     Uncertainty,
@@ -42,6 +43,7 @@ from dlo_calibration.simulation.protocol import Simulator
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
 STARTS = 4  # simulations of each trial from initial chains with other noise
+LOOKED_AT = (0.15, 0.4, 0.65, 0.9)  # values of a parameter of which nothing is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,7 @@ class Appraiser:
     :param length: of the DLO [m].
     :param table_height: [m]; None if there is no table.
     :param noise: noise level: standard deviation of one measured coordinate [m]; nan if unknown.
+    :param guessed: names of the parameters that the observed chains alone do not tell.
     """
 
     space: ParameterSpace
@@ -126,6 +129,7 @@ class Appraiser:
     length: float
     table_height: float | None
     noise: float
+    guessed: tuple[str, ...] = ()
 
     def after(self, known: Knowledge, trials: Sequence[Trial]) -> Knowledge:
         """
@@ -136,9 +140,9 @@ class Appraiser:
         :raises SimulationError: if a trial cannot be simulated.
         """
         trials = [without_repeated_goals(one) for one in trials]
-        point, std = known.point, known.uncertainty.std
+        point, std = self._looked_around(known, trials), known.uncertainty.std
         models: list[TrialModel | None] = [*known.models, *[None] * (len(trials) - len(known.models))]
-        best: tuple[float, Floats, tuple[TrialModel, ...]] | None = None
+        best: tuple[Floats, Floats, tuple[TrialModel, ...]] | None = None
         for _ in range(ROUNDS):
             try:
                 now = tuple(one if one is not None and one.near(point) else self._model(trial, point, std)
@@ -150,12 +154,14 @@ class Appraiser:
                 continue
             models = list(now)
             fit, layout = _whole(now, trials, point)
-            found = at_minimum(fit, layout, noise=self.noise)
-            if best is not None and found.residual > best[0]:  # too far
-                point = (point + best[1]) / 2
-                continue
-            best = found.residual, point, now
             loss = Huber.of(fit.residuals)
+            if best is not None:
+                same = min(loss, Huber.of(best[0]))
+                if same.cost(fit.residuals) > same.cost(best[0]):  # too far
+                    point = (point + best[1]) / 2
+                    continue
+            best = fit.residuals, point, now
+            found = at_minimum(fit, layout, noise=self.noise)
             step = fit.weighted(loss.roots(fit.residuals) / found.scale).step(prior_information(len(point)))
             there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, 1.0)
             saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
@@ -167,6 +173,24 @@ class Appraiser:
         return self._examined(known.names, trials, point, tuple(
             one if one.complete else self._completed(one, trial)
             for one, trial in zip(now, trials, strict=True)))
+
+    def _looked_around(self, known: Knowledge, trials: Sequence[Trial]) -> Floats:
+        """
+        Return the (d,) point to begin at.
+
+        A parameter of which nothing is known, but which the last trial shows, may be so far away that no
+        derivative at a default value points there, as a DLO that is much more elastic than a rope.
+        """
+        shown = excites(trials[-1:], self.space, self.table_height)[0]
+        best = known.point
+        unknown = [k for k, name in enumerate(known.names) if name in self.guessed and shown[k]
+                   and known.uncertainty.verdicts[k] == NOT_IDENTIFIABLE]
+        for k in unknown:
+            points = [best, *(np.where(np.arange(len(best)) == k, value, best) for value in LOOKED_AT)]
+            seen = [self._residuals(trials, one) for one in points]
+            losses = [Huber.of(one) for one in seen if one is not None]
+            best = points[int(np.argmin([min(losses).cost(one) for one in seen]))] if losses else best
+        return best
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Knowledge:

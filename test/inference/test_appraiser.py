@@ -97,6 +97,23 @@ def test_a_trial_tells_what_it_shows_and_a_repeat_to_the_digit_nothing():
     assert std(third)[1] == pytest.approx(std(second)[1], rel=0.1)
 
 
+class Fading(ToySimulator):
+    """Friction below 50 of 100 has no effect, as stretching has none of a DLO that counts as stiff."""
+
+    def simulate(self, trial, physical):
+        least = SPACE.physical({'flexibility': 0, 'friction': 50}, 1.0)['friction']
+        return super().simulate(trial, {**physical, 'friction': max(physical['friction'], least)})
+
+
+def test_a_value_is_found_from_where_no_derivative_points_to_it():
+    start = np.array([0.4, 0.1])
+    known = Knowledge.before(SPACE.free, start)
+    one = noisy_trial('trial 1', 0)
+    after = Appraiser(SPACE, Fading(), 1.0, 0.0, noise([one]), guessed=('friction',)).after(known, [one])
+    assert after.point == pytest.approx([0.4, 0.7], abs=0.02)
+    assert after.uncertainty.verdicts == ('identifiable', 'identifiable')
+
+
 def test_points_that_were_not_seen_are_left_out():
     trial = noisy_trial('trial 1', 0)
     points = np.array(trial.goals[0].chain.points)
