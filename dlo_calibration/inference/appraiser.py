@@ -43,6 +43,7 @@ from dlo_calibration.simulation.protocol import Simulator
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
 STARTS = 4  # simulations of each trial from initial chains with other noise
+WORTH_A_MOVE = 0.1  # the same of a value that no derivative points to
 LOOKED_AT = (0.15, 0.4, 0.65, 0.9)  # values of a parameter of which nothing is known
 
 
@@ -189,7 +190,9 @@ class Appraiser:
             points = [best, *(np.where(np.arange(len(best)) == k, value, best) for value in LOOKED_AT)]
             seen = [self._residuals(trials, one) for one in points]
             losses = [Huber.of(one) for one in seen if one is not None]
-            best = points[int(np.argmin([min(losses).cost(one) for one in seen]))] if losses else best
+            costs = [min(losses).cost(one) for one in seen] if losses else [0.0]
+            if min(costs) < (1 - WORTH_A_MOVE) * costs[0]:
+                best = points[int(np.argmin(costs))]
         return best
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
