@@ -114,6 +114,21 @@ def without_repeated_goals(trial: Trial) -> Trial:
     return replace(trial, goals=tuple(goals))
 
 
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """The (m,) residuals [m] of all trials at a (d,) point, the models of the trials, and the uncertainty."""
+
+    residuals: Floats
+    point: Floats
+    models: tuple[TrialModel, ...]
+    found: Uncertainty
+
+    @property
+    def loss(self) -> Huber:
+        """The loss that suits the residuals."""
+        return Huber.of(self.residuals)
+
+
 @dataclass(frozen=True)
 class Appraiser:
     """
@@ -141,9 +156,20 @@ class Appraiser:
         :raises SimulationError: if a trial cannot be simulated.
         """
         trials = [without_repeated_goals(one) for one in trials]
-        point, std = self._looked_around(known, trials), known.uncertainty.std
-        models: list[TrialModel | None] = [*known.models, *[None] * (len(trials) - len(known.models))]
-        best: tuple[Floats, Floats, tuple[TrialModel, ...]] | None = None
+        models = [*known.models, *[None] * (len(trials) - len(known.models))]
+        best = self._descended(trials, models, known.point, known.uncertainty.std)
+        elsewhere = self._looked_around(trials, best)
+        if elsewhere is not None:
+            best = min(best, self._descended(trials, [None] * len(trials), elsewhere, known.uncertainty.std),
+                       key=lambda one: best.loss.cost(one.residuals))
+        return self._examined(known.names, trials, best.point, tuple(
+            one if one.complete else self._completed(one, trial)
+            for one, trial in zip(best.models, trials, strict=True)))
+
+    def _descended(self, trials: Sequence[Trial], models: Sequence[TrialModel | None], point: Floats,
+                   std: Floats) -> _Minimum:
+        """Return where Gauss-Newton steps from a (d,) point end; `models` are used where they hold."""
+        best: _Minimum | None = None
         for _ in range(ROUNDS):
             try:
                 now = tuple(one if one is not None and one.near(point) else self._model(trial, point, std)
@@ -151,18 +177,18 @@ class Appraiser:
             except SimulationError:
                 if best is None:
                     raise
-                point = (point + best[1]) / 2
+                point = (point + best.point) / 2
                 continue
-            models = list(now)
+            models = now
             fit, layout = _whole(now, trials, point)
             loss = Huber.of(fit.residuals)
             if best is not None:
-                same = min(loss, Huber.of(best[0]))
-                if same.cost(fit.residuals) > same.cost(best[0]):  # too far
-                    point = (point + best[1]) / 2
+                same = min(loss, best.loss)
+                if same.cost(fit.residuals) > same.cost(best.residuals):  # too far
+                    point = (point + best.point) / 2
                     continue
-            best = fit.residuals, point, now
             found = at_minimum(fit, layout, noise=self.noise)
+            best = _Minimum(fit.residuals, point, now, found)
             step = fit.weighted(loss.roots(fit.residuals) / found.scale).step(prior_information(len(point)))
             there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, 1.0)
             saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
@@ -170,30 +196,25 @@ class Appraiser:
                 break
             point, std = there, found.std
         assert best is not None
-        _, point, now = best
-        return self._examined(known.names, trials, point, tuple(
-            one if one.complete else self._completed(one, trial)
-            for one, trial in zip(now, trials, strict=True)))
-
-    def _looked_around(self, known: Knowledge, trials: Sequence[Trial]) -> Floats:
-        """
-        Return the (d,) point to begin at.
-
-        A parameter of which nothing is known, but which the last trial shows, may be so far away that no
-        derivative at a default value points there, as a DLO that is much more elastic than a rope.
-        """
-        shown = excites(trials[-1:], self.space, self.table_height)[0]
-        best = known.point
-        unknown = [k for k, name in enumerate(known.names) if name in self.guessed and shown[k]
-                   and known.uncertainty.verdicts[k] == NOT_IDENTIFIABLE]
-        for k in unknown:
-            points = [best, *(np.where(np.arange(len(best)) == k, value, best) for value in LOOKED_AT)]
-            seen = [self._residuals(trials, one) for one in points]
-            losses = [Huber.of(one) for one in seen if one is not None]
-            costs = [min(losses).cost(one) for one in seen] if losses else [0.0]
-            if min(costs) < (1 - WORTH_A_MOVE) * costs[0]:
-                best = points[int(np.argmin(costs))]
         return best
+
+    def _looked_around(self, trials: Sequence[Trial], best: _Minimum) -> Floats | None:
+        """
+        Return a (d,) point that fits clearly better than a minimum; None if there is none.
+
+        A parameter that the trials show may be so far away that no derivative at its default points there, as
+        of a DLO that is much more elastic than a rope.
+        """
+        shown = np.logical_or.reduce(excites(trials, self.space, self.table_height))
+        found = best.point
+        for k, name in enumerate(self.space.free):
+            if name not in self.guessed or not shown[k] or best.found.verdicts[k] != NOT_IDENTIFIABLE:
+                continue
+            points = [found, *(np.where(np.arange(len(found)) == k, value, found) for value in LOOKED_AT)]
+            costs = [best.loss.cost(self._residuals(trials, one)) for one in points]
+            if min(costs) < (1 - WORTH_A_MOVE) * costs[0]:
+                found = points[int(np.argmin(costs))]
+        return None if found is best.point else found
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
                   models: tuple[TrialModel, ...]) -> Knowledge:
