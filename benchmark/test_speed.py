@@ -9,15 +9,20 @@ from figures import SAMPLES, side_by_side, table, write
 import numpy as np
 import pytest
 
-from dlo_calibration.files.session import read_session
+from dlo_calibration import Action, Chain, Goal, Hand, read_session, Trial
 from dlo_calibration.model.parameters import knot_names, ParameterSpace
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation import kernels, kernels_together  # noqa: F401  # compiled, if it was not
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
 
 NODES = (12, 30, 60, 120)
 ROUNDS = 7
 ACTIONS = ('place_end', 'drag_quarter', 'hold_middle', 'two_hands')
+SETS = 12
+TOGETHER = {  # what is simulated -> free parameters
+    'object 1 on a table': ('flexibility', 'elasticity', 'friction', 'self_collision'),
+    'a cable between two clamps': ('flexibility', 'damping', 'internal_damping', 'torsion',
+                                   'bending_friction', 'natural_curvature')}
 VALUES = {'flexibility': 66.7, 'friction': 69.7}  # the truth of object 1
 HOW = ('Object 1; a settled round is one trial simulated until the DLO has come to rest. Shortest of '
        f'{ROUNDS} repetitions, in which the engines take turns in one process; its processor time.')
@@ -34,9 +39,10 @@ def object1():
 @pytest.fixture(scope='module')
 def tables():
     """Collect the rows, and write the tables when they are complete."""
-    speeds, trials, parts, cables = [], [], [], []
-    yield speeds, trials, parts, cables
-    if len(parts) < len(NODES) or len(trials) < len(ACTIONS) or not cables:
+    speeds, trials, parts, cables, together = [], [], [], [], []
+    yield speeds, trials, parts, cables, together
+    wanted = [len(NODES), len(ACTIONS), len(TOGETHER), 5]
+    if [len(one) for one in (parts, trials, together, cables)] != wanted:
         return  # a part was measured alone
     nodes = np.log([row[0] for row in speeds])
     growth = [np.polyfit(nodes, np.log([row[column] for row in speeds]), 1)[0] for column in (4, 5)]
@@ -49,6 +55,9 @@ def tables():
         f'{growth[0]:.2f} (bullet) and {growth[1]:.2f} (compiled; {last:.2f} from {NODES[-2]} to '
         f'{NODES[-1]}).',
         table(['trial, 41 nodes', 'bullet, ms', 'compiled, ms', 'ratio', 'steps'], trials),
+        f'{SETS} random parameter sets, 41 nodes and 3 ms, each alone and four at a time:',
+        table(['trials', 'rounds', 'alone, rounds per second', 'together, rounds per second', 'ratio',
+               'alone, µs per step', 'together, µs per step'], together),
         'A cable of 41 nodes that two clamps swing in the air:',
         table(['physics', 'compiled, µs per step', 'relative to plain'], cables),
         'What a compiled round is spent on, in µs:',
@@ -110,6 +119,33 @@ def test_cables(benchmark, tables):
                      for name, taken in seconds.items())
 
 
+def swung():
+    """Return a trial: two clamps swing a cable in the air, one of them turns."""
+    chain = Chain(np.linspace(0, 1.2, 41)[:, None] * [1.0, 0, 0])
+    left = Hand('left', (0, 1), [0.0, 1.0], [(0, 0, 0), (0.1, 0.3, 0)])
+    right = Hand('right', (39, 40), [0.0, 0.5, 1.0], [(1.17, 0, 0), (0.9, 0.2, 0.1), (0.8, 0.0, 0)],
+                 [(0, 0, 0, 1), (0.25, 0, 0, 0.97), (0.5, 0, 0, 0.87)])
+    goals = tuple(Goal(chain, time, stable=False, held_by=('left', 'right')) for time in (0.5, 1.0, 1.5))
+    return Trial('swung', chain, (Action((left, right)),), goals)
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize('name', TOGETHER)
+def test_together(benchmark, name, tables):
+    lies = name.endswith('table')
+    trials, simulator = object1()[0] if lies else [swung()] * 4, CompiledSimulator(table=lies)
+    space, random = ParameterSpace(TOGETHER[name]), np.random.default_rng(1)
+    sets = [space.physical(space.values(random.random(len(space.free))), 0.6) for _ in range(SETS)]
+    jobs = [(trial, physical) for physical in sets for trial in trials]
+    steps = sum(simulator.simulate(*job).steps for job in jobs)
+    simulator.simulate_together(jobs)
+    seconds = side_by_side(benchmark, {'alone': lambda: [simulator.simulate(*job) for job in jobs],
+                                       'together': lambda: simulator.simulate_together(jobs)}, ROUNDS)
+    rates = [len(jobs) / one for one in seconds.values()]
+    tables[4].append([name, len(jobs), *(f'{rate:.0f}' for rate in rates), f'{rates[1] / rates[0]:.2f}',
+                      *(f'{1e6 * one / steps:.2f}' for one in seconds.values())])
+
+
 class Watch:
     """Stands in for a kernel, calls it, and measures its time."""
 
@@ -128,7 +164,7 @@ class Watch:
 def look_for_no_contact(arguments):
     """Change the rope of `kernels.advance` so that it checks no pair of segments for contact."""
     contact = arguments[0].contact
-    contact.room[0], contact.near[0] = np.inf, 0
+    contact.room[:] = np.inf
 
 
 @pytest.mark.benchmark(timer=time.process_time)

@@ -66,8 +66,6 @@ UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
 WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
 SKIN = 0.0001, 0.008  # m, least and most; pairs within this gap are checked until nodes may have moved so far
 STEPS_AHEAD = 10.0  # between these, the gap is as wide as nodes move in so many steps
-BESIDE = 3  # segments; pairs that are not further from each other along the DLO
-FAST = 0.001  # m; where nodes move further in a step, it is first asked whether all are clear of each other
 
 BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
 
@@ -83,6 +81,13 @@ def record(record: Any) -> Any:
 def part(kernel: Kernel) -> Kernel:
     """Compile a function together with the kernels that call it."""
     options: dict[str, Any] = {'_nrt': False}  # parts make no arrays: references to them need not be counted
+    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
+    return compile_(kernel)  # type: ignore[no-any-return]
+
+
+def _of_numbers(kernel: Kernel) -> Kernel:
+    """Compile a part in which no number is nan, so that the least of many is found four at once."""
+    options: dict[str, Any] = {'_nrt': False, 'fastmath': {'nnan', 'nsz'}}
     compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
@@ -235,11 +240,11 @@ class SelfContact(NamedTuple):
     :param distances: (S, S) [m] least distances of the pairs.
     :param pairs: (S (S - 1) / 2, 2) segments; the first `near` of these pairs are near each other.
     :param near: (1,) number of these pairs.
-    :param room: (2,) [m] how far nodes may move until pairs must be searched again, negative: search now; and
-        until pairs that are further than `BESIDE` along the DLO must be.
+    :param room: (3,) [m] how far neighbours may still move against each other until segments that are near
+        along the DLO can touch; how far nodes may until others can, and until `pairs` must be found anew.
     :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
     :param change: (S + 1, 3) workspace.
-    :param motion: (14, S) workspace.
+    :param balls: (8, S) workspace.
     :param overlaps: (1,) 1 if some of `distances` may be below the diameter.
     :param next_one: how many segments further the first one is that a segment can touch.
     """
@@ -255,7 +260,7 @@ class SelfContact(NamedTuple):
     room: Vector
     contacts: Contacts
     change: Matrix
-    motion: Matrix
+    balls: Matrix
     overlaps: Indices
     next_one: int
 
@@ -958,7 +963,7 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
     """
     half, middles, pairs, diameter = contact.half, contact.middles, contact.pairs, contact.diameter
     apart, count, segments, longest = contact.apart, 0, len(half), 0.0
-    x, y, z = contact.motion[0], contact.motion[1], contact.motion[2]
+    x, y, z = contact.balls[0], contact.balls[1], contact.balls[2]
     for i in range(segments):
         x[i] = (points[i, 0] + points[i + 1, 0]) / 2
         y[i] = (points[i, 1] + points[i + 1, 1]) / 2
@@ -1110,102 +1115,95 @@ def _pass_on(contacts: Contacts, count: int, inverse_masses: Vector, velocities:
 
 
 @part
-def travel(velocities: Matrix, step: float) -> float:
-    """Return an upper bound [m] of how far two nodes approach each other in a step."""
+def movement(velocities: Matrix, step: float) -> tuple[float, float]:
+    """Return upper bounds [m] of how two nodes, and two neighbours, move against each other in a step."""
     n = len(velocities)
-    mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
+    middle = n // 2
+    away, beside = 0.0, 0.0
     for i in range(n):
-        mean_x += velocities[i, 0]
-        mean_y += velocities[i, 1]
-        mean_z += velocities[i, 2]
-    mean_x, mean_y, mean_z = mean_x / n, mean_y / n, mean_z / n
-    fastest = 0.0  # beside the common motion
-    for i in range(n):
-        x, y, z = velocities[i, 0] - mean_x, velocities[i, 1] - mean_y, velocities[i, 2] - mean_z
-        fastest = max(fastest, x * x + y * y + z * z)
-    return 2 * step * math.sqrt(fastest)
+        x, y = velocities[i, 0] - velocities[middle, 0], velocities[i, 1] - velocities[middle, 1]
+        z = velocities[i, 2] - velocities[middle, 2]
+        away = max(away, x * x + y * y + z * z)
+    for i in range(n - 1):
+        x, y = velocities[i + 1, 0] - velocities[i, 0], velocities[i + 1, 1] - velocities[i, 1]
+        z = velocities[i + 1, 2] - velocities[i, 2]
+        beside = max(beside, x * x + y * y + z * z)
+    return 2 * step * math.sqrt(away), step * math.sqrt(beside)
+
+
+@_of_numbers
+def _least_gap(balls: Matrix, count: int, away: int) -> float:
+    """
+    Return the least gap [m] between balls, each and the one that is `away` further.
+
+    :param balls: (4, n) [m] centres and radii; the first `count` columns.
+    """
+    x, y, z, radius = balls[0], balls[1], balls[2], balls[3]
+    # Slices, and no branch in the loop: the compiler makes four steps at once of it.
+    x_there, y_there, z_there, radius_there = x[away:], y[away:], z[away:], radius[away:]
+    least = math.inf
+    for i in range(count - away):
+        a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
+        least = min(least, math.sqrt(a * a + b * b + c * c) - radius_there[i] - radius[i])
+    return least
 
 
 @part
-def _are_clear(balls: Matrix, count: int, first: int, last: int, skin: float) -> bool:
+def _find_room(contact: SelfContact, points: Matrix) -> None:
     """
-    Tell whether balls stay apart in a step, each from those that are `first` to `last` further.
+    Find how far nodes may move until any segments can touch.
 
-    :param balls: (7, n) [m] centres, motion of the centres in the step, and radii; the first `count` columns.
-    :param skin: [m] gap that is left between them.
+    All pairs are checked, which takes less time than a search that branches: near ones along the DLO by balls
+    around segments, the others by balls around two segments.
     """
-    x, y, z, u, v, w, radius = balls[0], balls[1], balls[2], balls[3], balls[4], balls[5], balls[6]
-    for away in range(first, min(last + 1, count)):
-        met = 0
-        # Slices, and no branch in the loop: the compiler makes four steps at once of it.
-        x_there, y_there, z_there, radius_there = x[away:], y[away:], z[away:], radius[away:]
-        u_there, v_there, w_there = u[away:], v[away:], w[away:]
-        for i in range(count - away):
-            a, b, c = x_there[i] - x[i], y_there[i] - y[i], z_there[i] - z[i]
-            d, e, f = u_there[i] - u[i], v_there[i] - v[i], w_there[i] - w[i]
-            radii = radius_there[i] + radius[i] + skin
-            # (p + q)^2 <= 1.2 p^2 + 6 q^2
-            met += not a * a + b * b + c * c > 1.2 * radii * radii + 6.0 * (d * d + e * e + f * f)
-        if met > 0:
-            return False
-    return True
-
-
-@part
-def _stays_clear(contact: SelfContact, points: Matrix, velocities: Matrix, step: float, way: float) -> bool:
-    """
-    Tell whether surely no two segments touch each other within a step; see `is_near`.
-
-    All pairs are checked, which takes less time than a search that branches: near ones by balls around
-    segments, the others by balls around two segments, if possible for the following steps, too.
-    """
-    diameter, segments, next_one = contact.diameter, len(contact.half), contact.next_one
-    single, double = contact.motion[:7], contact.motion[7:]
+    radius, segments, room = contact.diameter / 2, len(contact.half), contact.room
+    single, double = contact.balls[:4], contact.balls[4:]
     for i in range(segments):
-        length, change = 0.0, 0.0
+        length = 0.0
         for c in range(3):
             single[c, i] = (points[i, c] + points[i + 1, c]) / 2
-            single[3 + c, i] = step * (velocities[i, c] + velocities[i + 1, c]) / 2
             length += (points[i + 1, c] - points[i, c])**2
-            change += (velocities[i + 1, c] - velocities[i, c])**2
-        single[6, i] = (diameter + math.sqrt(length) + step * math.sqrt(change)) / 2
-    if not _are_clear(single, segments, next_one, BESIDE, 0.0):
-        return False
-    if contact.room[1] >= 0:
-        return True
+        single[3, i] = radius + math.sqrt(length) / 2
     count = (segments + 1) // 2
     for k in range(count):
         i = 2 * k + 1
         for c in range(3):
-            double[c, k], double[3 + c, k] = points[i, c], step * velocities[i, c]
-        double[6, k] = 2 * max(single[6, i - 1], single[6, min(i, segments - 1)]) - diameter / 2
-    first, skin = max(2, next_one // 2), STEPS_AHEAD * way
-    if _are_clear(double, count, first, count, skin):
-        contact.room[1] = skin
-        return True
-    return _are_clear(double, count, first, count, 0.0)
+            double[c, k] = points[i, c]
+        double[3, k] = 2 * max(single[3, i - 1], single[3, min(i, segments - 1)]) - radius
+    room[:2] = math.inf
+    first = 2 + contact.next_one // 2
+    for away in range(contact.next_one, min(2 * first - 1, segments)):
+        room[0] = min(room[0], _least_gap(single, segments, away) / (away + 1))
+    for away in range(first, count):
+        room[1] = min(room[1], _least_gap(double, count, away))
 
 
 @part
-def is_near(contact: SelfContact, points: Matrix, velocities: Matrix, step: float, way: float) -> bool:
+def is_near(contact: SelfContact, points: Matrix, last: tuple[float, float],
+            coming: tuple[float, float]) -> bool:
     """
     Tell whether the DLO may touch itself in a step, and find the pairs of segments that are near.
 
-    :param way: [m] of `travel`.
+    :param last: `movement` in the last step.
+    :param coming: `movement` in this step without contact.
     """
     near, room = contact.near, contact.room
-    room[0] -= way
-    room[1] -= way
-    if room[0] < 0:
-        if way > FAST and _stays_clear(contact, points, velocities, step, way):
-            near[0] = 0
+    room[0] -= last[1]
+    room[1] -= last[0]
+    room[2] -= last[0]
+    if room[0] >= coming[1] and room[1] >= coming[0]:
+        return False
+    if room[2] < coming[0]:
+        _find_room(contact, points)
+        if room[0] >= coming[1] and room[1] >= coming[0]:
+            room[2] = -1.0
             if contact.overlaps[0] == 1:
                 contact.distances[:] = contact.diameter
                 contact.overlaps[0] = 0
             return False
-        skin = min(max(SKIN[0], STEPS_AHEAD * way), SKIN[1])
-        near[0] = near_pairs(contact, points, 1.2, way + skin)  # a segment may be stretched by 20 %
-        room[0] = skin
+        room[2] = coming[0] + min(max(SKIN[0], STEPS_AHEAD * coming[0]), SKIN[1])
+        near[0] = near_pairs(contact, points, 1.2, room[2])  # a segment may be stretched by 20 %
+        room[:2] = -1.0
     return bool(near[0] > 0)
 
 
@@ -1287,7 +1285,7 @@ def predict_velocities(rope: RopeState, targets: Matrix, turns: Matrix) -> bool:
     if not rod_velocities(rod, points, velocities, predicted):
         return False
     turn_clamps(rod.frame.clamped, rod.frame.clamps, turns)
-    if is_near(contact, points, predicted, rod.step, travel(predicted, rod.step)):
+    if is_near(contact, points, movement(velocities, rod.step), movement(predicted, rod.step)):
         keep_apart(contact, points, predicted, rod.inverse_masses, rope.support, rod.step)
     return True
 
@@ -1312,7 +1310,7 @@ def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cub
             return k
         if len(turns) > 0:
             turn_clamps(rod.frame.clamped, rod.frame.clamps, turns[k])
-        if is_near(contact, points, predicted, step, travel(predicted, step)):
+        if is_near(contact, points, movement(velocities, step), movement(predicted, step)):
             keep_apart(contact, points, predicted, inverse_masses, support, step)
         for i in range(len(points)):
             for c in range(3):

@@ -24,15 +24,14 @@ from dlo_calibration.simulation.kernels import (
     keep_apart,
     let_follow,
     Matrix,
+    movement,
     part,
     record,
     rest_on_table,
     rod_velocities,
     RodState,
-    RopeState,
     SelfContact,
     SlipState,
-    travel,
     turn_clamps,
     TYPES,
     Vector,
@@ -40,7 +39,7 @@ from dlo_calibration.simulation.kernels import (
 from dlo_calibration.simulation.lanes import COUNT, lanes_of, where
 
 GOES_ON, STABLE, DIVERGED = 0, 1, 2
-DRAG, IMPLICIT, FRICTION, LEVEL, TRAVEL, SOLVED = range(6)  # rows of `Together.numbers`
+DRAG, IMPLICIT, FRICTION, LEVEL, SOLVED, LAST, COMING = 0, 1, 2, 3, 4, 5, 7  # rows of `Together.numbers`
 
 
 @record
@@ -59,7 +58,6 @@ class Move(NamedTuple):
     :param progress: (4,) steps taken; steps until the next check; checks made; how the move ended: `GOES_ON`,
         `STABLE` or `DIVERGED`.
     :param held: see `RodState`, like the following; they are those of the DLO.
-    :param points: see `RopeState`, like the following; workspace until the DLO leaves.
     :param contact: contact of the DLO with itself.
     """
 
@@ -74,9 +72,6 @@ class Move(NamedTuple):
     held: Indices
     follow: Matrix
     inverse_masses: Vector
-    points: Matrix
-    predicted: Matrix
-    support: Matrix
     contact: SelfContact
 
 
@@ -87,13 +82,14 @@ class Together(NamedTuple):
 
     What the arrays are is said at `RopeState`, `RodState`, `FrameState` and `SlipState`.
 
-    :param numbers: (6, COUNT) drag, `implicit`, friction, height of nodes on the table [m], how far
-        nodes may approach each other in a step [m], and 1 where the step could be solved.
+    :param numbers: (9, COUNT) drag, `implicit`, friction, height of nodes on the table [m], 1 where the step
+        could be solved, and two rows each of `movement` in the last step and the coming one.
     :param lane: (COUNT,) 0, 1, 2, ...
     :param gravity: (3,) is the same for all, like the following.
     :param step: time step [s].
     :param clamped: (s, 2).
     :param begun: (1,) 1.
+    :param one: (3, N, 3) workspace: points, predicted velocities and support of one of them.
     """
 
     points: Cube
@@ -123,16 +119,11 @@ class Together(NamedTuple):
     step: float
     clamped: IndexRows
     begun: Indices
+    one: Cube
 
 
 Moves = tuple[Move, ...]
 TYPES['Moves'] = numba.types.UniTuple(TYPES['Move'], COUNT)
-
-
-@part
-def _copy_in(lanes: Matrix, lane: int, numbers: Vector) -> None:
-    for i in range(len(numbers)):
-        lanes[i, lane] = numbers[i]
 
 
 @part
@@ -143,57 +134,10 @@ def _copy_rows_in(lanes: Cube, lane: int, numbers: Matrix) -> None:
 
 
 @part
-def _copy_out(lanes: Matrix, lane: int, numbers: Vector) -> None:
-    for i in range(len(numbers)):
-        numbers[i] = lanes[i, lane]
-
-
-@part
 def _copy_rows_out(lanes: Cube, lane: int, numbers: Matrix) -> None:
     for i in range(numbers.shape[0]):
         for k in range(numbers.shape[1]):
             numbers[i, k] = lanes[i, k, lane]
-
-
-@entry
-def enter(rope: RopeState, level: float, together: Together, lane: int) -> None:
-    """Copy a DLO's state into a lane; `level` is the height of nodes that touch the table [m]."""
-    rod, frame, friction = rope.rod, rope.rod.frame, rope.rod.friction
-    _copy_rows_in(together.points, lane, rope.points)
-    _copy_rows_in(together.velocities, lane, rope.velocities)
-    _copy_rows_in(together.support, lane, rope.support)
-    _copy_in(together.rest_lengths, lane, rod.rest_lengths)
-    _copy_in(together.stiffness, lane, rod.stiffness)
-    _copy_in(together.masses, lane, rod.masses)
-    _copy_rows_in(together.bending, lane, rod.bending)
-    if len(frame.angles) > 0:
-        _copy_rows_in(together.natural, lane, frame.natural)
-        _copy_in(together.twisting, lane, frame.twisting)
-        _copy_in(together.angles, lane, frame.angles)
-        _copy_rows_in(together.clamps, lane, frame.clamps)
-        _copy_rows_in(together.carried, lane, frame.carried)
-        _copy_rows_in(together.joints, lane, frame.joints)
-    if len(friction.rows) > 0:
-        _copy_rows_in(together.rows, lane, friction.rows)
-        _copy_rows_in(together.kept, lane, friction.kept)
-    together.numbers[DRAG, lane], together.numbers[IMPLICIT, lane] = rod.drag, rod.implicit
-    together.numbers[FRICTION, lane], together.numbers[LEVEL, lane] = rope.contact.friction, level
-
-
-@entry
-def leave(rope: RopeState, together: Together, lane: int) -> None:
-    """Copy a DLO's state back from a lane."""
-    frame, friction = rope.rod.frame, rope.rod.friction
-    _copy_rows_out(together.points, lane, rope.points)
-    _copy_rows_out(together.velocities, lane, rope.velocities)
-    _copy_rows_out(together.support, lane, rope.support)
-    if len(frame.angles) > 0:
-        _copy_out(together.angles, lane, frame.angles)
-        _copy_rows_out(together.clamps, lane, frame.clamps)
-        _copy_rows_out(together.carried, lane, frame.carried)
-        _copy_rows_out(together.joints, lane, frame.joints)
-    if len(friction.rows) > 0:
-        _copy_rows_out(together.kept, lane, friction.kept)
 
 
 @part
@@ -208,13 +152,14 @@ def _aim(move: Move, points: Cube, lane: int, step: float) -> None:
 @part
 def _follow_through(move: Move, together: Together, lane: int) -> None:
     """Turn a DLO's clamps with their hands, and let it not pass through itself in the coming step."""
-    contact, points, predicted, support = move.contact, move.points, move.predicted, move.support
+    contact, points, predicted, support = move.contact, together.one[0], together.one[1], together.one[2]
     if len(move.turns) > 0:
         turn_clamps(together.clamped, together.clamps[:, :, lane],
                     move.turns[min(move.progress[0], len(move.turns) - 1)])
-    if together.numbers[SOLVED, lane] == 1.0 and is_near(
-            contact, together.points[:, :, lane], together.predicted[:, :, lane], together.step,
-            together.numbers[TRAVEL, lane]):
+    numbers = together.numbers[:, lane]
+    if numbers[SOLVED] == 1.0 and is_near(
+            contact, together.points[:, :, lane], (numbers[LAST], numbers[LAST + 1]),
+            (numbers[COMING], numbers[COMING + 1])):
         _copy_rows_out(together.points, lane, points)
         _copy_rows_out(together.predicted, lane, predicted)
         _copy_rows_out(together.support, lane, support)
@@ -267,7 +212,7 @@ def advance_together(moves: Moves, together: Together, count: int, used: int) ->
     """
     Take steps of several DLOs at once, each as `kernels.advance` would take it, until a move ends.
 
-    :param moves: of `COUNT` DLOs that have entered; those that are not used may be any of the others.
+    :param moves: of `COUNT` DLOs; those that are not used may be any of the others.
     :param count: most steps to take.
     :param used: how many of the DLOs are to move.
     :returns: number of steps taken.
@@ -301,7 +246,8 @@ def advance_together(moves: Moves, together: Together, count: int, used: int) ->
             for k in range(3):
                 velocities[i, k] += step * together.gravity[k]
         lanes[SOLVED] = where(rod_velocities(rod, points, velocities, predicted), 1.0, 0.0)
-        lanes[TRAVEL] = travel(predicted, step)
+        lanes[LAST], lanes[LAST + 1] = movement(velocities, step)
+        lanes[COMING], lanes[COMING + 1] = movement(predicted, step)
         _follow_through(a, together, lane[0])
         if used > 1:
             _follow_through(b, together, lane[1])

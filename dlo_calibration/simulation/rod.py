@@ -43,14 +43,17 @@ stiffness, an inner node has the stiffness of the pieces on its two sides in ser
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import knot_names, KNOTS, PART_NAMES
 from dlo_calibration.simulation.kernels import BAND, FrameState, RodState, SlipState
+
+_KNOT_NAMES = knot_names(KNOTS[-1])
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ class RodProperties:
         Optional ones may be absent, as in results of older versions.
         """
         profile = (1.0, *(physical[name] for name in PART_NAMES if name in physical))
-        known = [physical[name] for name in knot_names(KNOTS[-1]) if name in physical]
+        known = [physical[name] for name in _KNOT_NAMES if name in physical]
         return cls(bending_stiffness=physical['flexibility'], stretching_stiffness=physical['elasticity'],
                    mass=physical['mass'], drag=physical['damping'],
                    internal_damping=physical['internal_damping'],
@@ -126,14 +129,11 @@ class Rod:
                  features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
         rest_lengths = rest_lengths * properties.length_scale
-        weights = np.zeros(n)
-        weights[:-1] += rest_lengths / 2
-        weights[1:] += rest_lengths / 2
-        masses = properties.mass * weights / weights.sum()
+        self._rows, weights, total = _rows_and_weights(rest_lengths.tobytes())
+        masses = properties.mass * weights / total
         if features is not None:
             masses += properties.marker_mass * features
         self._properties, self._holds = properties, False
-        self._rows = _curvature_rows(rest_lengths)
         self.state = RodState(
             rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
             masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), frame=_no_frame(),
@@ -159,12 +159,8 @@ class Rod:
         if self._holds and np.array_equal(held, state.held):
             return
         self._holds = True
-        follows = np.zeros(len(state.masses), bool)
-        follows[held] = True
-        rigid = follows[:-1] & follows[1:]
+        follows, rigid, cells = _cells(state.rest_lengths.tobytes(), tuple(nodes))
         stiffnesses = self._stiffnesses(rigid)
-        bendable = np.where(rigid, 0.0, state.rest_lengths)
-        cells = (bendable[:-1] + bendable[1:]) / 2  # [m] length that bends at each inner node
         joints = np.divide(stiffnesses, cells, out=np.zeros_like(cells), where=cells > 0)
         self.state = state._replace(
             held=held, follow=np.zeros((len(held), 3)),
@@ -179,7 +175,7 @@ class Rod:
         properties, before = self._properties, self.state.frame
         twists = properties.torsion > 0
         clamped = np.flatnonzero(rigid) if twists else np.zeros(0, np.int64)
-        curved = bool(properties.natural_curvature) or bool(np.any(properties.rest_curvature))
+        curved = bool(properties.natural_curvature) or any(map(any, properties.rest_curvature))
         if not (curved or len(clamped)) or rigid.all():
             return _no_frame() if len(before.angles) else before
         n = len(rigid)
@@ -215,15 +211,17 @@ class Rod:
         slip = properties.bending_slip
         rows = np.column_stack([self._rows, joints * (properties.bending_friction / slip), cells * slip])
         if not len(before.rows):
-            before = before._replace(kept=np.zeros((len(cells), 9)), pull=np.zeros((len(cells) + 2, 6)))
+            before = before._replace(kept=np.zeros((len(cells), 9)), begun=np.zeros(1, np.int64),
+                                     pull=np.zeros((len(cells) + 2, 6)))
         return before._replace(rows=rows)
 
     def _stiffnesses(self, rigid: NDArray[np.bool_]) -> Floats:
         """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
-        lengths, profile = self.state.rest_lengths, np.array(self._properties.profile)
+        lengths = self.state.rest_lengths
         stiffness: Floats = np.full(len(lengths) - 1, self._properties.bending_stiffness)
-        if (profile == 1).all():
+        if all(part == 1 for part in self._properties.profile):
             return stiffness
+        profile = np.array(self._properties.profile)
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         bounds = np.linspace(0, ends[-1], len(profile) + 1)
         flexibility = np.concatenate([[0.0], np.cumsum(np.diff(bounds) / profile)])  # up to each bound
@@ -252,33 +250,64 @@ def _frame_of(segments: int) -> FrameState:
         turning=np.zeros((segments, 2)))
 
 
+@lru_cache(maxsize=1)
 def _no_frame() -> FrameState:
     """Return the frame of a straight DLO that does not resist twist."""
     return _frame_of(0)
 
 
+@lru_cache(maxsize=1)
 def _no_friction() -> SlipState:
     """Return the state of a DLO without friction between strands."""
     return SlipState(rows=np.zeros((0, 5)), kept=np.zeros((0, 9)), begun=np.zeros(1, np.int64),
                      pull=np.zeros((0, 6)))
 
 
-def _curvature_rows(rest_lengths: Floats) -> Floats:
-    """Return (N - 2, 3) [1/m]: multiplied by three nodes, they give the change of the unit tangent there."""
+# The trials of a calibration have the same lengths again and again.
+@lru_cache(maxsize=256)
+def _rows_and_weights(lengths: bytes) -> tuple[Floats, Floats, float]:
+    """
+    Return what depends on the rest lengths alone.
+
+    :returns: (N - 2, 3) [1/m]: multiplied by three nodes, they give the change of the unit tangent there;
+        (N,) [m] the length that belongs to each node; and their sum.
+    """
+    rest_lengths = np.frombuffer(lengths)
     before, after = 1 / rest_lengths[:-1], 1 / rest_lengths[1:]
-    return np.stack([before, -(before + after), after], axis=1)
+    weights = np.zeros(len(rest_lengths) + 1)
+    weights[:-1] += rest_lengths / 2
+    weights[1:] += rest_lengths / 2
+    return (frozen_array(np.stack([before, -(before + after), after], axis=1)), frozen_array(weights),
+            float(weights.sum()))
+
+
+@lru_cache(maxsize=256)
+def _cells(lengths: bytes, held: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats]:
+    """
+    Return what depends on the rest lengths and on the held nodes.
+
+    :returns: (N,) which nodes are held; (N - 1,) which segments are rigid; (N - 2,) [m] the length that
+        bends at each inner node.
+    """
+    rest_lengths = np.frombuffer(lengths)
+    follows = np.zeros(len(rest_lengths) + 1, bool)
+    follows[list(held)] = True
+    rigid = follows[:-1] & follows[1:]
+    bendable = np.where(rigid, 0.0, rest_lengths)
+    return follows, rigid, frozen_array((bendable[:-1] + bendable[1:]) / 2)
 
 
 def _bending_bands(rows: Floats, joints: Floats) -> Floats:
     """
     Return the diagonal and the two below it, (3, N) [N/m], of the symmetric (N, N) bending matrix.
 
-    :param rows: see `_curvature_rows`.
+    :param rows: see `_rows_and_weights`.
     :param joints: (N - 2,) [N m] moment per angle at the inner nodes.
     """
     n = len(rows) + 2
     bands = np.zeros((3, n))
     for a in range(3):
+        weighted = joints * rows[:, a]
         for b in range(a + 1):
-            bands[a - b, b:n - 2 + b] += joints * rows[:, a] * rows[:, b]
+            bands[a - b, b:n - 2 + b] += weighted * rows[:, b]
     return bands

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Mapping, Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.rod import Rod, RodProperties
 
@@ -89,18 +90,34 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
     :param radius: self-collision radius [m].
     :param friction: Coulomb coefficient.
     """
-    segments, half = len(rest_lengths), rest_lengths / 2
-    count, middles = segments * (segments - 1) // 2, rest_lengths.cumsum() - half
-    apart = max(np.pi * radius, float(half.max()))
-    gaps = np.subtract.outer(middles - half, middles + half)  # [j, i]: arc length between two segments
-    beyond = np.subtract(*np.nonzero(gaps > apart))
+    half, middles, widest = _widest_gaps(rest_lengths.tobytes())
+    segments = len(half)
+    count, apart = segments * (segments - 1) // 2, max(np.pi * radius, float(half.max()))
+    beyond = np.flatnonzero(widest > apart)
     return kernels.SelfContact(
         half=half, middles=middles, diameter=2.0 * radius, apart=apart, friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
-        near=np.zeros(1, np.int64), room=np.full(2, -1.0),
+        near=np.zeros(1, np.int64), room=np.full(3, -1.0),
         contacts=np.empty(count, kernels.CONTACT),
-        change=np.empty((segments + 1, 3)), motion=np.empty((14, segments)),
-        overlaps=np.zeros(1, np.int64), next_one=int(beyond.min(initial=segments)))
+        change=np.empty((segments + 1, 3)), balls=np.empty((8, segments)),
+        overlaps=np.zeros(1, np.int64), next_one=int(beyond[0]) if len(beyond) else segments)
+
+
+@lru_cache(maxsize=256)
+def _widest_gaps(lengths: bytes) -> tuple[Floats, Floats, Floats]:
+    """
+    Return what depends on the lengths of S segments alone, each (S,) [m].
+
+    :returns: `half` and `middles` of `kernels.SelfContact`; the largest arc length between two segments, by
+        how many segments one is further than the other.
+    """
+    rest_lengths = np.frombuffer(lengths)
+    half = rest_lengths / 2
+    middles = rest_lengths.cumsum() - half
+    starts, ends = middles - half, middles + half
+    gaps = [float((starts[k:] - ends[:len(ends) - k]).max()) for k in range(len(half))]
+    # Kernels take arrays that can be written to, but write to neither of these.
+    return half, middles, frozen_array(gaps)
 
 
 def diverged() -> SimulationError:

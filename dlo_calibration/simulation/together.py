@@ -20,6 +20,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.simulation import kernels_together
 from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.kernels import RodState, RopeState
 from dlo_calibration.simulation.lanes import COUNT
 from dlo_calibration.simulation.protocol import advanced, Rollout
 from dlo_calibration.simulation.rollout import Course, PIECE, take
@@ -45,9 +46,9 @@ class Lanes:
             natural=room(frame.natural), twisting=room(frame.twisting), angles=room(frame.angles),
             clamps=room(frame.clamps), carried=room(frame.carried), segments=room(frame.segments),
             joints=room(frame.joints), turning=room(frame.turning), rows=room(friction.rows),
-            kept=room(friction.kept), pull=room(friction.pull), numbers=_aligned(6, COUNT),
+            kept=room(friction.kept), pull=room(friction.pull), numbers=_aligned(9, COUNT),
             lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
-            begun=np.ones(1, np.int64))
+            begun=np.ones(1, np.int64), one=np.empty((3, n, 3)))
         self._ropes: list[RolloutUnderWay] = []
 
     def let_in(self, rollouts: Sequence[RolloutUnderWay]) -> None:
@@ -62,14 +63,25 @@ class Lanes:
         for lane, place in enumerate(places):
             if place is None:
                 place = places[lane] = next(coming)
-                kernels_together.enter(place.rope.state, place.rope.level, self.state, lane)
+                self._take_in(place.rope, lane)
                 place.inside = True
         self._ropes = [one for one in places if one is not None]
 
     def let_out(self, one: RolloutUnderWay) -> None:
         """Give a rope its state back."""
-        kernels_together.leave(one.rope.state, self.state, self._ropes.index(one))
+        lane = self._ropes.index(one)
+        for name, array in _changing(one.rope.state).items():
+            array[...] = getattr(self.state, name)[..., lane]
         one.inside = False
+
+    def _take_in(self, rope: CompiledRope, lane: int) -> None:
+        rod = rope.state.rod
+        for name, array in {**_changing(rope.state), **_lasting(rod)}.items():
+            getattr(self.state, name)[..., lane] = array
+        numbers = self.state.numbers[:, lane]
+        numbers[kernels_together.DRAG], numbers[kernels_together.IMPLICIT] = rod.drag, rod.implicit
+        numbers[kernels_together.FRICTION] = rope.state.contact.friction
+        numbers[kernels_together.LEVEL] = rope.level
 
     def advance(self, count: int) -> None:
         """Take steps of all ropes that are in, at most `count`, until one of their moves ends."""
@@ -77,6 +89,21 @@ class Lanes:
         kernels_together.advance_together(
             (*moves, *[moves[0]] * (COUNT - len(moves))), self.state, count, len(moves))
         advanced()
+
+
+def _changing(rope: RopeState) -> dict[str, Floats]:
+    """Return what steps change of a rope, by the names of `kernels_together.Together`."""
+    frame = rope.rod.frame
+    return {'points': rope.points, 'velocities': rope.velocities, 'support': rope.support,
+            'angles': frame.angles, 'clamps': frame.clamps, 'carried': frame.carried, 'joints': frame.joints,
+            'kept': rope.rod.friction.kept}
+
+
+def _lasting(rod: RodState) -> dict[str, Floats]:
+    """Return what steps do not change of a rod, by the same names."""
+    return {'rest_lengths': rod.rest_lengths, 'stiffness': rod.stiffness, 'masses': rod.masses,
+            'bending': rod.bending, 'natural': rod.frame.natural, 'twisting': rod.frame.twisting,
+            'rows': rod.friction.rows}
 
 
 class RolloutUnderWay:
@@ -148,8 +175,7 @@ class RolloutUnderWay:
             periods=periods, seen=seen,
             distance=0.0 if steps.settling is None else steps.settling.distance,
             progress=np.array([first, until_check, 0, kernels_together.GOES_ON]), held=rod.held,
-            follow=rod.follow, inverse_masses=rod.inverse_masses, points=state.points,
-            predicted=state.predicted, support=state.support, contact=state.contact)
+            follow=rod.follow, inverse_masses=rod.inverse_masses, contact=state.contact)
         return True
 
 

@@ -51,7 +51,7 @@ class Touching:
 
     def __init__(self, places, radius, friction, time_step):
         self.state = self_contact(np.diff(places), radius, friction)
-        self._step = time_step
+        self._step, self._last = time_step, (0.0, 0.0)
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
@@ -60,12 +60,13 @@ class Touching:
     def check_every_pair(self, points):
         """Check every pair of segments in the coming steps, however far apart they are."""
         self.state.near[0] = kernels.near_pairs(self.state, points, 1.2, np.inf)
-        self.state.room[0] = np.inf
+        self.state.room[:] = -1.0, -1.0, np.inf
 
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         allowed = velocities.copy()
-        way = kernels.travel(allowed, self._step)
-        if kernels.is_near(self.state, points, allowed, self._step, way):
+        coming = kernels.movement(allowed, self._step)
+        if kernels.is_near(self.state, points, self._last, coming):
             kernels.keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
+        self._last = kernels.movement(allowed, self._step)
         return allowed
