@@ -115,8 +115,8 @@ def laid(dlo: KnownDlo, points: Floats, simulator: Simulator) -> Floats:
     """Return where a DLO that is laid at (81, 3) points [m] and let go comes to rest."""
     middle = len(points) // 2
     hand = Hand('hand_1', (middle,), np.array([0.0, 0.01]), points[[middle, middle]])
-    found: Floats = rehearse(simulator, Job(Chain(points), (Step(Action((hand,))),), dlo.physical)).chains[-1]
-    return found
+    found, = rehearse(simulator, [Job(Chain(points), (Step(Action((hand,))),), dlo.physical)])
+    return np.asarray(found.chains[-1])
 
 
 def _moved(points: Floats, angle: float, offset: Floats) -> Floats:

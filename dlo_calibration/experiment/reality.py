@@ -51,7 +51,7 @@ class Reality:
         if hands:
             # All actions are simulated again, as a chain alone does not tell how much the DLO is stretched.
             steps = (*self._steps, Step(Action(hands)))
-            found = rehearse(self._simulator, Job(self._start, steps, self._physical))
+            found, = rehearse(self._simulator, [Job(self._start, steps, self._physical)])
             if found.failure:
                 raise SimulationError(found.failure)
             self._steps, self.points = list(steps), found.chains[-1]

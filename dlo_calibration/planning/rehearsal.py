@@ -8,7 +8,8 @@ from __future__ import annotations
 from concurrent.futures import CancelledError, Executor, Future
 import copy
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
+import math
 import pickle
 import threading
 from typing import Callable, Mapping, Sequence
@@ -17,10 +18,11 @@ import uuid
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.batch import AT_A_TIME
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.protocol import advanced, Simulator
+from dlo_calibration.simulation.protocol import Rollout, simulate_all, Simulator, TogetherSimulator
 
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
 REST = 0.01  # s from the end of an action to the instant from which on the DLO comes to rest
@@ -112,21 +114,29 @@ def _on_the_way(action: Action) -> Floats:
     return np.linspace(action.start, action.end, pieces + 1)[1:-1]
 
 
-def rehearse(simulator: Simulator, job: Job, trial: Trial | None = None) -> Rehearsal:
+def rehearse(simulator: Simulator, jobs: Sequence[Job],
+             between: Callable[[], None] = lambda: None) -> list[Rehearsal]:
     """
-    Simulate a sequence of actions; a simulation that diverges gives a rehearsal with a failure.
+    Simulate sequences of actions; a simulation that diverges gives a rehearsal with a failure.
 
-    :param trial: that of the job; None: it is made.
+    :param between: is called again and again; what it raises ends the simulation.
     """
-    if trial is None:
-        trial = rehearsed_trial(job.start, job.steps, job.courses)
-    try:
-        rollout = simulator.simulate(trial, job.physical)
-    except SimulationError as error:
+    trials: list[Trial] = []
+    for job, before in zip(jobs, [None, *jobs], strict=False):
+        # Draws of the same actions share their trial, as a simulator lays out each trial anew.
+        trials.append(trials[-1] if before is not None and job.same_actions(before) else
+                      rehearsed_trial(job.start, job.steps, job.courses))
+    rollouts = simulate_all(simulator, [(trial, job.physical) for trial, job in zip(
+        trials, jobs, strict=True)], between)
+    return [_rehearsal(job, trial, rollout) for job, trial, rollout in zip(
+        jobs, trials, rollouts, strict=True)]
+
+
+def _rehearsal(job: Job, trial: Trial, rollout: Rollout | SimulationError) -> Rehearsal:
+    """Return what happened in the rollout of a job's trial."""
+    if isinstance(rollout, SimulationError):
         return Rehearsal(np.full((len(job.steps), len(job.start), 3), np.nan), (False,) * len(job.steps),
-                         failure=str(error))
-    finally:
-        advanced()
+                         failure=str(rollout))
     rests = [k for k, goal in enumerate(trial.goals) if goal.stable]
     courses = [rollout.chains[before + 1:rest] for before, rest in pairwise([-1, *rests])]
     return Rehearsal(rollout.chains[rests], tuple(rollout.settled[k] for k in rests),
@@ -166,31 +176,34 @@ class Rehearser:
         return found
 
     def _rehearsed_here(self, jobs: Sequence[Job]) -> list[Rehearsal]:
-        found = []
-        for job, before in zip(jobs, [None, *jobs], strict=False):
-            self._check()
-            # Draws of the same actions share their trial, as a simulator lays out each trial anew.
-            if before is None or not job.same_actions(before):
-                trial = rehearsed_trial(job.start, job.steps, job.courses)
-            found.append(rehearse(self._simulator, job, trial))
-        return found
+        return rehearse(self._simulator, jobs, self._check)
 
     def _rehearsed_by(self, executor: Executor, jobs: Sequence[Job]) -> list[Rehearsal]:
-        futures = [executor.submit(_rehearse_in_worker, self._key, self._packed, job) for job in jobs]
-        own: list[Rehearsal] = []  # of the last jobs, in reverse order
+        size = self._portion(executor, len(jobs))
+        portions = [jobs[first:first + size] for first in range(0, len(jobs), size)]
+        futures = [executor.submit(_rehearse_in_worker, self._key, self._packed, portion)
+                   for portion in portions]
+        own: list[list[Rehearsal]] = []  # of the last portions, in reverse order
         try:
-            while self._takes_part and len(own) < len(jobs) and futures[-1 - len(own)].cancel():
-                own += self._rehearsed_here([jobs[-1 - len(own)]])
-            return [*(self._awaited(future) for future in futures[:len(jobs) - len(own)]), *own[::-1]]
+            while self._takes_part and len(own) < len(portions) and futures[-1 - len(own)].cancel():
+                own.append(self._rehearsed_here(portions[-1 - len(own)]))
+            others = (self._awaited(future) for future in futures[:len(portions) - len(own)])
+            return list(chain.from_iterable([*others, *own[::-1]]))
         finally:
             for future in futures:
                 future.cancel()
+
+    def _portion(self, executor: Executor, jobs: int) -> int:
+        """Return how many of so many jobs are simulated at a time."""
+        if not isinstance(self._simulator, TogetherSimulator):
+            return 1
+        return min(AT_A_TIME, math.ceil(jobs / getattr(executor, 'workers', 1)))
 
     def _check(self) -> None:
         if self._should_stop():
             raise CancelledError
 
-    def _awaited(self, future: Future[Rehearsal]) -> Rehearsal:
+    def _awaited(self, future: Future[list[Rehearsal]]) -> list[Rehearsal]:
         while True:
             self._check()
             try:
@@ -210,13 +223,13 @@ class _WorkerThread(threading.local):
 _worker_thread = _WorkerThread()
 
 
-def _rehearse_in_worker(key: str, packed: bytes, job: Job) -> Rehearsal:
-    """Rehearse a job in a worker, which keeps the simulator of a plan."""
+def _rehearse_in_worker(key: str, packed: bytes, jobs: Sequence[Job]) -> list[Rehearsal]:
+    """Rehearse jobs in a worker, which keeps the simulator of a plan."""
     if _worker_thread.key != key:
         if _worker_thread.key:
             _worker_thread.simulator.close()
         _worker_thread.simulator = copy.copy(pickle.loads(packed))  # noqa: S301  # sent by the parent process
         _worker_thread.key = key
-    return rehearse(_worker_thread.simulator, job)
+    return rehearse(_worker_thread.simulator, jobs)
 
 

@@ -12,14 +12,14 @@ from __future__ import annotations
 from concurrent.futures import CancelledError, wait
 from contextlib import closing
 import threading
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, Mapping, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Rollout, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
 
 PERIOD = 0.05  # s between two looks whether to wait no longer
 
@@ -133,6 +133,11 @@ class MadeWhereUsed:
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """Simulate a trial with the engine."""
         return self._made().simulate(trial, physical)
+
+    def simulate_together(self, jobs: Sequence[Job],
+                          between: Callable[[], None]) -> list[Rollout | SimulationError]:
+        """Simulate each job with the engine; see `TogetherSimulator`."""
+        return list(simulate_all(self._made(), jobs, between))
 
     def refined(self) -> Simulator | None:
         """Return the finer engine."""

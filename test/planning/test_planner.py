@@ -22,7 +22,9 @@ from dlo_calibration.planning.objective import Objective
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.prediction import simulate
-from dlo_calibration.planning.rehearsal import in_turn, Job, rehearse, Rehearser, Step
+from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearser, Step
+from dlo_calibration.simulation import kernels_together  # noqa: F401  # compiled, if it was not
+from dlo_calibration.simulation.compiled import CompiledSimulator
 
 DLO = MadeUpDlo()
 QUICK = Options(nodes=25, time_step=0.004)
@@ -96,19 +98,41 @@ def test_more_actions_than_permitted_are_not_planned():
     assert found.error_after < found.error_before
 
 
+class OneByOne(CompiledSimulator):
+    """It simulates one trial after the other."""
+
+    simulate_together = None  # type: ignore[assignment]
+
+
+def assert_same(one, other):
+    """Assert that two plans are the same, bit for bit."""
+    assert (one.rollouts, one.error_after, one.score_after) == (
+        other.rollouts, other.error_after, other.score_after)
+    for here, there in zip(one.actions, other.actions, strict=True):
+        for name in ('predicted', 'lower', 'upper'):
+            np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+        np.testing.assert_array_equal(here.action.hands[0].positions, there.action.hands[0].positions)
+
+
 def test_processes_find_the_same_plan_as_this_thread():
-    alone = planned(TWO_MOVES)
     executor = ProcessExecutor(2)
     try:
         together = plan(DLO, straight(), TWO_MOVES, ONE, make_simulator=new_soft, executor=executor)
     finally:
         executor.close()
-    assert together.rollouts == alone.rollouts
-    assert together.error_after == alone.error_after
-    for one, other in zip(alone.actions, together.actions, strict=True):
-        np.testing.assert_array_equal(one.predicted, other.predicted)
-        np.testing.assert_array_equal(one.lower, other.lower)
-        np.testing.assert_array_equal(one.action.hands[0].positions, other.action.hands[0].positions)
+    assert_same(planned(TWO_MOVES), together)
+
+
+def test_sequences_simulated_together_give_the_plan_of_sequences_simulated_one_by_one():
+    def found(simulator, workers):
+        return plan(DLO, straight(9), goal, replace(ONE, actions=2, kinds=('drag',), workers=workers),
+                    make_simulator=lambda _: simulator)
+
+    goal = Chain(follow(straight(9).points, 6, (0.0, 0.1)))
+    alone = found(OneByOne(nodes=15, time_step=0.006), 1)
+    assert len(alone.actions) == 2
+    assert_same(alone, found(CompiledSimulator(nodes=15, time_step=0.006), 1))
+    assert_same(alone, found(CompiledSimulator(nodes=15, time_step=0.006), 2))
 
 
 class Idle(Executor):
@@ -190,7 +214,7 @@ def test_the_dlo_keeps_out_of_a_no_go_box_on_its_way():
     jobs = [Job(straight(), in_turn([Step(one.action) for one in found.actions]), {}, courses=True)
             for found in (free, kept)]
     entered = [any(((np.abs(chain[:, 0]) < 0.05) & (chain[:, 1] > 0.04) & (chain[:, 1] < 0.08)).any()
-                   for course in rehearse(SoftSimulator(), job).courses for chain in course) for job in jobs]
+                   for course in one.courses for chain in course) for one in Rehearser(SoftSimulator())(jobs)]
     assert entered == [True, False]
 
 
@@ -204,7 +228,7 @@ def test_what_is_surer_is_preferred():
     objective, errors = Objective(straight(), goal, 'points'), []
     for found in plans:
         jobs = [Job(straight(), (Step(found.actions[0].action),), one) for one in others]
-        ends = [rehearse(SoftSimulator(unsure=True), job).chains[-1] for job in jobs]
+        ends = [one.chains[-1] for one in Rehearser(SoftSimulator(unsure=True))(jobs)]
         errors.append(np.mean([objective.error(end) for end in ends]))
     assert errors[1] < 0.5 * errors[0]
 
