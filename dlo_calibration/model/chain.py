@@ -108,10 +108,10 @@ def put_back(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
     return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
     """
-    Ordered points along a DLO, first to last.
+    Ordered points along a DLO, first to last; it equals only itself.
 
     A point with NaN was not seen.  If at least half of the points were, and three, it is put back, see
     `put_back`, as if the points were equally spaced.

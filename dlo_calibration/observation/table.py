@@ -27,7 +27,7 @@ def resting_level(trial: Trial, table_height: float) -> float | None:
     """
     chains: list[Chain] = [trial.initial] if trial.velocity is None else []
     chains += [goal.chain for goal in trial.goals if goal.stable]
-    level = min((lowest_level(chain) for chain in chains), default=np.inf)
+    level = min((lowest_level(chain) for chain in dict.fromkeys(chains)), default=np.inf)
     return level if level - table_height < HANGING else None
 
 
@@ -89,6 +89,8 @@ def _stacked(points: Floats, level: float) -> NDArray[np.bool_]:
     """
     rise = np.diff(points[:, 2])
     stacked = np.zeros(len(points), bool)
+    if np.ptp(points[:, 2]) < STACKED:
+        return stacked
     for here, there, s, t in zip(*crossing_segments(points), strict=True):
         higher = float(points[there, 2] + t * rise[there] - points[here, 2] - s * rise[here])
         if abs(higher) >= STACKED:

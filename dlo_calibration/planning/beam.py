@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Generator, Mapping, Protocol, Sequence, TypeVar
 
 import numpy as np
@@ -56,8 +57,13 @@ class Course:
 
     @property
     def end(self) -> Floats:
-        """The chain after the last move, (n, 3) [m]."""
+        """The points after the last move, (n, 3) [m]."""
         return np.asarray(self.chains[-1])
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The chain after the last move; one for all that follows, as finding its noise takes its time."""
+        return Chain(self.end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +307,7 @@ class BeamSearch:
         return [found.get(id(draft)) for draft in drafts]
 
     def _chain(self, course: Course) -> Chain:
-        return self._start if not course.moves else Chain(course.end)
+        return course.chain if course.moves else self._start
 
     def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[Step, ...]:
         return in_turn([move.step(points, self._levels, self._options.height, self._options.speed)

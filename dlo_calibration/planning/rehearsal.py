@@ -43,7 +43,7 @@ class Step:
     def starting(self, time: float) -> Step:
         """Return the same step with an action that starts at a time [s]."""
         shift = time - self.action.start
-        return replace(self, action=Action(tuple(
+        return self if shift == 0 else replace(self, action=Action(tuple(
             replace(hand, times=hand.times + shift) for hand in self.action.hands)))
 
 

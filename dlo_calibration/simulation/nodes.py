@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+import heapq
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place, interpolation_matrix
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.clamps import clamp_directions
-from dlo_calibration.observation.noise import NO_NOISE, noise, smooth
+from dlo_calibration.observation.noise import NO_NOISE, noise, noise_of, smooth
 
 MERGED = 0.15  # of the mean distance of nodes
 
@@ -118,10 +120,21 @@ def feature_shares(chain: Chain, places: Floats) -> Floats:
 
 def _without_noise(trial: Trial) -> Chain:
     """Return the initial chain, smoothed according to the noise level of the trial."""
-    sigma = noise([trial])
+    if all(goal.chain is trial.initial for goal in trial.goals):
+        return _without_noise_of_its_own(trial.initial, 1 + len(trial.goals))
+    return _smoothed(trial.initial, noise([trial]))
+
+
+@lru_cache(maxsize=8)
+def _without_noise_of_its_own(initial: Chain, views: int) -> Chain:
+    """Return an initial chain that nothing was observed after, as in many trials of a plan; see above."""
+    return _smoothed(initial, noise_of([np.stack([initial.observed] * views)]))
+
+
+def _smoothed(initial: Chain, sigma: float) -> Chain:
     if not sigma > NO_NOISE:
-        return trial.initial
-    return replace(trial.initial, points=smooth(trial.initial.points, sigma))
+        return initial
+    return replace(initial, points=smooth(initial.points, sigma))
 
 
 def spread_places(fixed: Floats, count: int, rigid: NDArray[np.bool_] | None = None) -> Floats:
@@ -134,8 +147,12 @@ def spread_places(fixed: Floats, count: int, rigid: NDArray[np.bool_] | None = N
     widths = np.diff(fixed)
     if rigid is not None and not rigid.all():
         widths[rigid] = 0.0
-    while pieces.sum() < count - 1:
-        pieces[np.argmax(widths / pieces)] += 1
+    longest = [(-width, k) for k, width in enumerate(widths.tolist())]
+    heapq.heapify(longest)
+    for _ in range(count - 1 - len(pieces)):
+        k = longest[0][1]
+        pieces[k] += 1
+        heapq.heapreplace(longest, (-widths[k] / pieces[k], k))
     parts = [np.linspace(a, b, k, endpoint=False)
              for a, b, k in zip(fixed[:-1], fixed[1:], pieces, strict=True)]
     return np.append(np.concatenate(parts), fixed[-1])
