@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import re
+import warnings
 
 from bent import arc
 from calibrated import LENGTH, MadeUpDlo, straight
@@ -125,12 +126,55 @@ def test_another_form_is_refused():
         text_of(MadeUpDlo(), straight(), 'newton-1.5')
 
 
+def everything(form):
+    """Return the text of a DLO that has all there can be in a file."""
+    chain = Chain(arc().points, features=np.isin(np.arange(21), [0, 10]))
+    return text_of(with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0), chain, form)
+
+
 @pytest.mark.parametrize('form', ['newton-1.6', 'newton-1.4'])
-def test_usd_core_reads_it(form):
+def test_usd_core_finds_no_fault_in_it(form, tmp_path):
     usd = pytest.importorskip('pxr.Usd', reason='needs usd-core')
-    stage = usd.Stage.CreateInMemory()
-    assert stage.GetRootLayer().ImportFromString(text_of(with_values(natural_curvature=30.0), arc(), form))
+    validation = pytest.importorskip('pxr.UsdValidation', reason='needs usd-core 25.11 or later')
+    (tmp_path / 'dlo.usda').write_text(everything(form))
+    stage = usd.Stage.Open(str(tmp_path / 'dlo.usda'))
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    faults = validation.ValidationContext(validators).Validate(stage)
+    assert [fault.GetMessage() for fault in faults] == []
     curve = stage.GetDefaultPrim().GetChild('curve')
     assert len(curve.GetAttribute('points').Get()) == 13
     material = stage.GetPrimAtPath(curve.GetRelationship('material:binding:physics').GetTargets()[0])
     assert 'PhysicsCurvesDeformableMaterialAPI' in str(material.GetMetadata('apiSchemas'))
+    of_proposal = set()
+    for prim in stage.Traverse():
+        for attribute in prim.GetAuthoredAttributes():
+            name, definition = attribute.GetName(), prim.GetPrimDefinition()
+            known = definition.GetAttributeDefinition(name)
+            assert attribute.Get() is not None, name
+            if known:
+                assert attribute.GetTypeName() == known.GetTypeName(), name
+            else:
+                of_proposal.add(name.split(':')[0])
+    assert of_proposal <= {'physics', 'newton'}
+
+
+def test_newton_reads_mass_stiffness_damping_friction_and_rest_shape(tmp_path):
+    newton = pytest.importorskip('newton', minversion='1.8', reason='needs newton 1.8 and usd-core')
+    (tmp_path / 'dlo.usda').write_text(everything('newton-1.6'))
+    builder = newton.ModelBuilder()
+    with warnings.catch_warnings():
+        warnings.simplefilter('error', newton.NewtonWarning)
+        builder.add_usd(str(tmp_path / 'dlo.usda'))
+    found = with_values(natural_curvature=30.0, marker_mass=60.0, self_collision=100.0)
+    chain = Chain(arc().points, features=np.isin(np.arange(21), [0, 10]))
+    rope = ExportedRope.of(found, chain, OPTIONS)
+    assert sum(builder.body_mass) == pytest.approx(0.03 + rope.marker_masses.sum(), rel=1e-5)
+    stiffness = np.reshape(builder.joint_target_ke[-6 * 11:], (11, 6))
+    assert stiffness[:, 2] == pytest.approx(rope.stretching_stiffness / rope.cells, rel=1e-4)
+    assert stiffness[:, 3] == pytest.approx(rope.bending_stiffness / rope.cells, rel=1e-4)
+    damping = np.reshape(builder.joint_target_kd[-6 * 11:], (11, 6))
+    assert damping == pytest.approx(stiffness * rope.internal_damping, rel=1e-4)
+    rest = 2 * np.arccos(np.abs(np.reshape(builder.joint_rest_q[-7 * 11:], (11, 7))[:, 6]))
+    assert rest == pytest.approx(np.linalg.norm(rope.natural_curvature, axis=1) * rope.cells, rel=1e-2)
+    assert builder.shape_material_mu[0] == pytest.approx(rope.friction, rel=1e-5)
+    assert builder.shape_scale[0][0] == pytest.approx(rope.radius, rel=1e-5)
