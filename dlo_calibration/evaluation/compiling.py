@@ -97,7 +97,7 @@ class Compiling:
         with self._lock:
             if self._closed:
                 return
-            self._executor = ProcessExecutor(1)
+            self._executor = ProcessExecutor(1, fresh=True)
         for text in filter(None, [_words(module), remark()]):
             self._news.put(text)
         try:

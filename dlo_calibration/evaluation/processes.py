@@ -6,6 +6,9 @@ ProcessExecutor: processes that simulate.
 
 They end as soon as the process that started them ends, for whatever reason.  A process that
 dies, or hangs, is replaced, and its call is repeated.
+
+They are forked from Python's fork server, which has loaded the kernels (`loaded`): so they begin at once,
+and share what it has loaded.
 """
 
 from __future__ import annotations
@@ -14,11 +17,13 @@ import atexit
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import connection, parent_process, resource_tracker
-from multiprocessing.context import SpawnProcess
+from multiprocessing import connection, forkserver, parent_process, resource_tracker, util
+from multiprocessing.context import ForkServerProcess, SpawnProcess
+from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
 import os
 import queue
+import shutil
 import signal
 import sys
 import threading
@@ -28,14 +33,16 @@ import types
 from typing import Any, Callable, Iterator, Mapping
 
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.simulation.protocol import advances
+from dlo_calibration.signals import before_end
 
+LOADED = 'dlo_calibration.evaluation.loaded'  # what the fork server imports
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 DEATHS = 3  # processes that may die at the same call before it fails
 ANSWER_LIMIT = 60.0  # s without a sign of life after which a process counts as hanging; the default
 SIGN_PERIOD = 0.25  # s between two signs of life; a small part of the shortest limit, 1 s
 START_LIMIT = 60.0  # s more for the first sign: on a busy machine Python may take some seconds to start
 _starting = threading.Lock()
+_loaded: list[str] = []
 
 
 def cores() -> int:
@@ -43,11 +50,21 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
+def begin_to_load() -> None:
+    """Start the fork server now, so that it loads the kernels while this process does something else."""
+    with _sheltered():
+        if not _loaded:
+            _loaded.append(LOADED)
+            forkserver.set_forkserver_preload(_loaded)
+            before_end(lambda: shutil.rmtree(util.get_temp_dir(), ignore_errors=True))  # its socket is there
+        forkserver.ensure_running()
+
+
 class ProcessExecutor(Executor):
     """
-    An executor of `workers` fresh processes; 0: one per core.
+    An executor of `workers` processes; 0: one per core.
 
-    They start at once, and end by `close` or with the parent process.  They
+    They start with the first call, and end by `close` or with the parent process.  They
     ignore SIGINT and SIGTERM: the parent handles these.  They do not import the
     main module, so nothing that is defined there can be sent to them.  A process
     that dies is replaced and its call is repeated; a call at which `DEATHS`
@@ -56,37 +73,36 @@ class ProcessExecutor(Executor):
 
     :param on_death: called with a sentence for each death, from any thread.
     :param answer_limit: time [s] without a sign of life after which a process that works is killed.
+    :param fresh: whether they begin with nothing loaded, e.g. to compile kernels.
     """
 
     def __init__(self, workers: int, on_death: Callable[[str], None] = lambda _: None,
-                 answer_limit: float = ANSWER_LIMIT) -> None:
+                 answer_limit: float = ANSWER_LIMIT, fresh: bool = False) -> None:
+        self._fresh = fresh
         self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._on_death = on_death
         self._answer_limit = answer_limit
         self._closed = threading.Event()
         self._processes: dict[_Process, connection.Connection] = {}
+        self._threads: list[threading.Thread] = []
+        self._beginning = threading.Lock()  # guards `_threads`
         self._changing = threading.Lock()  # guards `_processes`
         # At exit, Python would send SIGTERM, which the processes ignore, and wait for them for ever.
         atexit.register(self.close)
-        first = []
         #: number of processes
         self.workers = workers or cores()
-        try:
-            for _ in range(self.workers):
-                first.append(self._new_process())
-        except BaseException:
-            self._kill()
-            raise
-        self._threads = [threading.Thread(target=self._serve, args=(process,), name='simulation', daemon=True)
-                         for process in first]
-        for thread in self._threads:
-            thread.start()
-        threading.Thread(target=self._watch, name='watching simulations', daemon=True).start()
+        if not fresh:
+            begin_to_load()
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
-        """Return a future that may be cancelled until a process takes it."""
+        """
+        Return a future that may be cancelled until a process takes it.
+
+        :raises DloCalibrationError: if no process can be started.
+        """
         if self._closed.is_set():
             raise RuntimeError('the executor is closed')
+        self._begin()
         task = _Task(Future(), call, args, keywords)
         self._tasks.put(task)
         return task.future
@@ -110,6 +126,24 @@ class ProcessExecutor(Executor):
         self._kill()
         self.shutdown()
 
+    def _begin(self) -> None:
+        """Start the processes, unless they have been."""
+        with self._beginning:
+            if self._threads:
+                return
+            first = []
+            try:
+                for _ in range(self.workers):
+                    first.append(self._new_process())
+            except BaseException:
+                self._kill()
+                raise
+            self._threads = [threading.Thread(target=self._serve, args=(process,), name='simulation',
+                                              daemon=True) for process in first]
+            for thread in self._threads:
+                thread.start()
+            threading.Thread(target=self._watch, name='watching simulations', daemon=True).start()
+
     def _cancel_waiting(self) -> None:
         while True:
             try:
@@ -132,10 +166,10 @@ class ProcessExecutor(Executor):
             if self._closed.is_set():
                 raise CancelledError
             here, there = connection.Pipe()
-            process = _Process(target=_work, args=(there,), daemon=True)
+            process = (_Fresh if self._fresh else _Forked)(target=_work, args=(there,), daemon=True)
             try:
                 process.start()
-            except OSError as error:
+            except (OSError, EOFError) as error:  # EOFError: the fork server has ended
                 raise DloCalibrationError(f'a process that simulates could not be started ({error}); '
                                           'use fewer workers') from error
             finally:
@@ -238,33 +272,43 @@ class _Task:
     keywords: Mapping[str, Any]
 
 
-class _Process(SpawnProcess):
-    """A spawned process that starts with signals blocked and without the parent's main module."""
+class _Process(BaseProcess):
+    """A process that starts with signals blocked and without the parent's main module."""
 
     works = False  # whether it executes a call
     silence = -START_LIMIT  # s without a sign of life while it worked
 
     def start(self) -> None:
-        # Start Python's resource tracker first: starting it later would unblock the signals again.
-        resource_tracker.ensure_running()
-        # The main module may load rclpy, which a child does not need.
-        with _starting, _blocked_signals():
-            main = sys.modules['__main__']
-            sys.modules['__main__'] = types.ModuleType('__main__')
-            try:
-                super().start()
-            finally:
-                sys.modules['__main__'] = main
+        with _sheltered():
+            super().start()
+
+
+class _Forked(_Process, ForkServerProcess):
+    """A process that begins with what the fork server has loaded."""
+
+
+class _Fresh(_Process, SpawnProcess):
+    """A process that begins with nothing loaded."""
 
 
 @contextmanager
-def _blocked_signals() -> Iterator[None]:
-    """Block SIGINT and SIGTERM in this thread; a process started here begins with them blocked."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _sheltered() -> Iterator[None]:
+    """
+    Block SIGINT and SIGTERM in this thread, and hide the main module.
+
+    A process started here begins with the signals blocked; the main module may load rclpy, which it does not
+    need.
+    """
+    # Start Python's resource tracker first: starting it later would unblock the signals again.
+    resource_tracker.ensure_running()
+    with _starting:
+        before, main = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS), sys.modules['__main__']
+        sys.modules['__main__'] = types.ModuleType('__main__')
+        try:
+            yield
+        finally:
+            sys.modules['__main__'] = main
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(channel: connection.Connection) -> None:
@@ -296,6 +340,8 @@ def _give_signs(channel: connection.Connection, sending: threading.Lock, works: 
     A process that is stopped gives none, nor does one in whose simulation nothing is counted.  Before
     the first count it may be loading modules or compiling, which nothing counts.
     """
+    from dlo_calibration.simulation.protocol import advances  # loads NumPy, which the parent need not
+
     seen = 0
     while works.wait():
         count = advances()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import os
 import time
 
-from processes import children
+from processes import simulating
 import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import new_toy, ToySimulator
@@ -108,16 +108,15 @@ def test_an_engine_that_cannot_be_had_gives_a_sentence():
 
 
 def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
-    before = set(children(os.getpid()))
     appraiser = LiveInformation(lambda _: ToySimulator(seconds=1000.0))
     appraiser.start(TRIALS, OPTIONS)
     begun = time.monotonic()
-    while not set(children(os.getpid())) - before:
+    while not simulating(os.getpid()):
         assert time.monotonic() - begun < PATIENCE
         time.sleep(0.01)
     with pytest.raises(DloCalibrationError, match='under way'):
         appraiser.start(TRIALS, OPTIONS)
     appraiser.stop()
     assert appraiser.join(PATIENCE)
-    assert not any('spawn_main' in line for pid, line in children(os.getpid()).items() if pid not in before)
+    assert not simulating(os.getpid())
     assert list(appraiser.waiting_information()) == []

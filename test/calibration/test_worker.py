@@ -12,7 +12,7 @@ import threading
 import time
 
 import numpy as np
-from processes import children
+from processes import simulating
 import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import Deadly, new_toy, ToySimulator
@@ -185,7 +185,7 @@ def spawned(parent, count):
     """Wait until a process has `count` spawned children, and return their ids."""
     begun = time.monotonic()
     while time.monotonic() - begun < PATIENCE:
-        found = [pid for pid, command in children(parent).items() if 'spawn_main' in command]
+        found = simulating(parent)
         if len(found) >= count:
             return found
         time.sleep(0.02)

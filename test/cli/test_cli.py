@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 
-from processes import children
+from processes import simulating
 import pytest
 from serial import serial
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
@@ -364,7 +364,7 @@ def test_interrupt_gives_the_best_so_far_or_nothing(session, tmp_path, workers, 
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()
-    while not evaluated.exists() if code == 0 else len(children(process.pid)) < workers:
+    while not evaluated.exists() if code == 0 else len(simulating(process.pid)) < workers:
         assert time.monotonic() - begun < PATIENCE and process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)

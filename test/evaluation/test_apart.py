@@ -8,7 +8,7 @@ import copy
 import os
 import pickle
 
-from processes import children
+from processes import simulating as simulating_for
 import pytest
 from toy_messages import toy_trials
 from toy_simulator import Deadly, ToySimulator
@@ -34,7 +34,7 @@ def scene(tmp_path):
 
 def simulating():
     """Return the ids of the processes that simulate."""
-    return {pid for pid, text in children(os.getpid()).items() if 'spawn_main' in text}
+    return set(simulating_for(os.getpid()))
 
 
 def tried(simulator, point=MIDDLE):

@@ -6,9 +6,10 @@
 from concurrent.futures import CancelledError
 import os
 import signal
+import sys
 import time
 
-from processes import children
+from processes import simulating
 import pytest
 
 from dlo_calibration import DloCalibrationError, InputError
@@ -42,6 +43,10 @@ def fail_strangely():
     raise Unsendable(1, 2)
 
 
+def loaded():
+    return processes.LOADED in sys.modules
+
+
 def die_once(file):
     if not file.exists():
         file.touch()
@@ -49,8 +54,15 @@ def die_once(file):
     return 'done'
 
 
-def test_processes_are_there_before_anything_is_submitted(executor):
-    assert len([text for text in children(os.getpid()).values() if 'spawn_main' in text]) >= 2
+def test_processes_begin_with_what_the_fork_server_has_loaded(executor):
+    assert simulating(os.getpid()) == []
+    assert executor.submit(loaded).result(PATIENCE)
+    assert len(simulating(os.getpid())) == 2
+
+
+def test_fresh_processes_begin_with_nothing_loaded():
+    with processes.ProcessExecutor(1, fresh=True) as executor:
+        assert not executor.submit(loaded).result(PATIENCE)
 
 
 def test_answers_come_whatever_the_order(executor):
@@ -93,9 +105,8 @@ def test_a_call_that_kills_three_processes_is_given_up_alone(executor, told):
 
 def test_a_process_that_died_while_it_had_nothing_to_do_is_replaced(executor):
     assert executor.submit(abs, -1).result(PATIENCE) == 1
-    for pid, text in children(os.getpid()).items():
-        if 'spawn_main' in text:
-            os.kill(pid, signal.SIGKILL)
+    for pid in simulating(os.getpid()):
+        os.kill(pid, signal.SIGKILL)
     assert [executor.submit(abs, -k).result(PATIENCE) for k in range(10)] == list(range(10))
 
 

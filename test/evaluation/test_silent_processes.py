@@ -8,7 +8,7 @@ import os
 import signal
 import time
 
-from processes import children
+from processes import simulating
 import pytest
 from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
@@ -52,11 +52,10 @@ def advance_slowly():
 def test_a_process_that_hangs_is_replaced_and_one_that_is_slow_is_not(tmp_path):
     told = []
     with closing(ProcessExecutor(4, told.append, LIMIT)) as executor:
-        before = set(children(os.getpid()))
         slow = [executor.submit(advance_slowly), executor.submit(time.sleep, LIMIT + 1)]
         hanging = [executor.submit(call, tmp_path / call.__name__) for call in (stop_once, hang_once)]
         assert [future.result(PATIENCE) for future in hanging] == ['went on', 'went on']
-        assert slow[0].result(PATIENCE) in before
+        assert slow[0].result(PATIENCE) in simulating(os.getpid())
         assert slow[1].result(PATIENCE) is None  # it never began to simulate: it may be loading
     assert told == [TOLD, TOLD]
 
@@ -83,7 +82,7 @@ def test_a_worker_stopped_in_the_middle_of_a_search_is_told_and_changes_nothing(
 
     def stop(evaluation):
         if evaluation.index == 10:
-            worker = max(pid for pid, text in children(os.getpid()).items() if 'spawn_main' in text)
+            worker = max(simulating(os.getpid()))
             os.kill(worker, signal.SIGSTOP)
 
     torn = calibrate(toy_trials(2), Options(**{**vars(options), 'workers': 2, 'answer_limit': LIMIT}),

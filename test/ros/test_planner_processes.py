@@ -10,7 +10,7 @@ import signal
 import time
 
 import numpy as np
-from processes import children
+from processes import simulating
 import pytest
 from toy_simulator import new_toy, toy_trial, ToySimulator
 
@@ -56,7 +56,7 @@ def test_the_same_processes_simulate_until_their_number_changes(kept):
     again = processes.ready(Options(), 1)
     assert again is first and again.submit(os.getpid).result(PATIENCE) == process != os.getpid()
     two = processes.ready(Options(), 2)
-    assert process not in children(os.getpid())
+    assert process not in simulating(os.getpid())
     assert np.array_equal(simulated_there(two), ToySimulator().simulate(TRIAL, PHYSICAL).chains)
 
 
@@ -93,7 +93,7 @@ def test_closing_ends_the_processes_and_what_they_do(kept):
     process = executor.submit(os.getpid).result(PATIENCE)
     waiting = executor.submit(time.sleep, 1000)
     processes.close()
-    assert process not in children(os.getpid())
+    assert process not in simulating(os.getpid())
     with pytest.raises((CancelledError, RuntimeError)):
         waiting.result(PATIENCE)
 
@@ -104,7 +104,7 @@ def test_nothing_starts_after_closing(kept):
     processes.close()
     with pytest.raises(CancelledError):
         processes.ready(Options(), 1)
-    assert not [line for line in children(os.getpid()).values() if 'spawn_main' in line]
+    assert not simulating(os.getpid())
 
 
 def test_a_simulator_is_made_by_the_process_that_uses_it():

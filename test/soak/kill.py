@@ -18,7 +18,7 @@ import signal
 import time
 
 from domain import ros_graph
-from processes import children
+from processes import children, simulating
 from tally import peak_of, Tally
 from toy_messages import session_messages
 
@@ -74,7 +74,7 @@ def _node(folder, evaluations):
 
 
 def _simulating(process):
-    return [one for one, words in children(process.pid).items() if 'spawn_main' in words]
+    return simulating(process.pid)
 
 
 def _scores(robot):

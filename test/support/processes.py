@@ -19,6 +19,17 @@ def children(parent):
     return found
 
 
+def simulating(parent):
+    """List the ids of the processes that simulate for a process: it spawned them, or its fork server did."""
+    found = []
+    for pid, text in children(parent).items():
+        if 'spawn_main' in text:
+            found.append(pid)
+        elif 'multiprocessing.forkserver' in text:
+            found.extend(children(pid))
+    return found
+
+
 def of_session(leader):
     """Return the command lines of the living processes that were started in a process's session, by id."""
     found = {}

@@ -1,0 +1,25 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Loaded: importing this module loads what processes that simulate need, if the kernels are compiled.
+
+The fork server of `processes` imports it, once for all of them.  What is not compiled yet, or fails to load,
+each process loads when it needs it, and tells of it then.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from importlib import import_module
+import sys
+
+sys.path[:] = filter(None, sys.path)  # not the folder in which the user works: files there may have any name
+
+with suppress(Exception):
+    from dlo_calibration.simulation.kernel_cache import is_compiled, SIMULATION, TOGETHER
+
+    for _kernels, _user in ((SIMULATION, 'dlo_calibration.simulation.compiled'),
+                            (TOGETHER, 'dlo_calibration.simulation.together')):
+        if is_compiled(_kernels):
+            import_module(_user)
