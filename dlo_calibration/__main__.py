@@ -17,6 +17,11 @@ def main() -> int:
     # Where they were closed by whoever started the process, Python has none.
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:
+        if sys.argv[1:2] == ['fit'] and not any(word.startswith('--workers') for word in sys.argv):
+            from dlo_calibration.evaluation.processes import begin_to_load, cores
+
+            if cores() > 1:
+                begin_to_load()
         from dlo_calibration.cli.main import main as execute
         from dlo_calibration.cli.output import flush
 

@@ -13,6 +13,7 @@ from typing import Callable
 from dlo_calibration.calibration.automatic import choose, chooses_parts
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.apart import SimulatorApart
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
@@ -57,8 +58,8 @@ class Setting:
 
     @property
     def own_simulator(self) -> Simulator:
-        """The engine for stages that simulate in this thread; it remembers each rollout."""
-        return self.memory.simulator(self.simulator)
+        """The engine for stages that simulate one trial after the other; it remembers each rollout."""
+        return self.memory.simulator(self._alone)
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
                  finer: Simulator | None = None) -> BatchEvaluator:
@@ -74,6 +75,18 @@ class Setting:
                               self.memory.of(evaluator, finer is not None))
 
     @cached_property
+    def _alone(self) -> Simulator:
+        """The engine, in a process of its own where others simulate evaluations: this one loads no kernels."""
+        if self.executor is None:
+            return self.simulator
+        return SimulatorApart(self.simulator, 'trials', self.options.answer_limit)
+
+    def close(self) -> None:
+        """End the process that it may have started."""
+        if self.executor is not None and '_alone' in vars(self):
+            self._alone.close()
+
+    @cached_property
     def _usual(self) -> BatchEvaluator:
         return BatchEvaluator(Evaluator(self.trials, self.options.space, self.simulator, every_goal=False),
                               self.should_stop, self.executor)
@@ -86,7 +99,7 @@ class Setting:
         """
         if compared_rows(self.trials) is None:
             return one
-        evaluator = Evaluator(self.trials, space, self.simulator)
+        evaluator = Evaluator(self.trials, space, self._alone)
         memory = self.memory.of(evaluator)
         found = memory.find(one.index, one.point)
         if found is None:

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from dlo_calibration.evaluation.compiling import Compiling
     from dlo_calibration.simulation.protocol import Simulator
 
-TEXT = 'open the page in which photographs become trials, and calibrate there'
 FOLDER = Path('dlo-capture')
 PAPERS = ('a4', 'letter')
 #: Options that the page has fields for, that belong to recordings, or that only the node has.

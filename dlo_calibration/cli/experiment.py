@@ -26,7 +26,6 @@ from dlo_calibration.files.samples import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.signals import StopFlag
 
-TEXT = "repeat the paper's experiment, which measures how consistent and how valid the found parameters are"
 #: Options that are not taken from the recordings, so that they are the same for all objects.
 SAME_FOR_ALL = ('search', 'evaluations', 'seed', *names_of(MACHINE))
 

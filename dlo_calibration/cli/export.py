@@ -22,7 +22,6 @@ from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
 from dlo_calibration.writing import whole
 
-TEXT = 'write a calibrated DLO as a file for another simulator'
 USED = ('nodes', 'table', 'table_height')  # options
 #: Format -> what makes its text, and the names of its forms, the first one by default.
 FORMATS: Mapping[str, tuple[Callable[..., str], tuple[str, ...]]] = {

@@ -37,8 +37,6 @@ from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import make_folder
 
-TEXT = 'find the parameters that explain a session best'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""

@@ -15,7 +15,6 @@ from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.trial import Trial
 
-TEXT = 'show what a session contains'
 add_arguments = add_source
 
 

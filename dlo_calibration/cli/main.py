@@ -6,62 +6,47 @@
 from __future__ import annotations
 
 import argparse
-from multiprocessing import parent_process
+from importlib import import_module
 from signal import SIGINT
 import sys
-from typing import Any, NoReturn, Sequence
+from typing import Any, NoReturn, Sequence, TYPE_CHECKING
 
-from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
-from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli import (
-    capture,
-    experiment,
-    export,
-    fit,
-    info,
-    plan,
-    plot,
-    simulate,
-    trace,
-    validate,
-    warm_up,
-)
-from dlo_calibration.cli.options import dashed, PREFIX
 from dlo_calibration.cli.output import tell
 from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
 from dlo_calibration.signals import exit_code
-from dlo_calibration.simulation.kernel_cache import (
-    compile_kernels,
-    is_compiled,
-    KERNELS,
-    SIMULATION,
-    TOGETHER,
-)
-from dlo_calibration.simulation.protocol import Simulator
+
+if TYPE_CHECKING:
+    from dlo_calibration.calibration.engines import SimulatorFactory
 
 PROGRAM = 'dlo-calibration'  # as installed; begins each line of an error
-#: A verb's module has a `TEXT` for the help, `add_arguments`, and `act`, which returns the exit code.
-VERBS = {'capture': capture, 'trace': trace, 'fit': fit, 'validate': validate, 'simulate': simulate,
-         'plan': plan, 'export': export, 'info': info, 'plot': plot, 'experiment': experiment,
-         'warm-up': warm_up}
+#: What each verb does, for the help.
+VERBS = {
+    'capture': 'open the page in which photographs become trials, and calibrate there',
+    'trace': "find a DLO's middle line in a photograph from a few rough clicks, and with a scale its chain",
+    'fit': 'find the parameters that explain a session best',
+    'validate': 'simulate a session with the parameters of a result, without fitting',
+    'simulate': 'predict what a calibrated DLO does in the actions of a session or a request',
+    'plan': 'find actions that bring a calibrated DLO from one configuration to another',
+    'export': 'write a calibrated DLO as a file for another simulator',
+    'info': 'show what a session contains',
+    'plot': 'draw a picture of each trial, as measured and as simulated with a result',
+    'experiment': "repeat the paper's experiment, which measures how consistent and how valid the found "
+                  'parameters are',
+    'warm-up': 'compile everything for this machine, ahead of the first use',
+}
 
 
-def make_told(options: Options) -> Simulator:
-    """Return the simulator that `options` name; tell before its kernels are compiled, which takes long."""
-    if parent_process() is None:
-        for module in (SIMULATION, TOGETHER):
-            if not is_compiled(module):
-                tell(f'compiling the {KERNELS[module]} for this machine, once, about half a minute')
-                compile_kernels(module)
-    return make_chosen_simulator(options)
+def module_of(verb: str) -> Any:
+    """Import the module of a verb; it has `add_arguments`, and `act`, which returns the exit code."""
+    return import_module(f'dlo_calibration.cli.{verb.replace("-", "_")}')
 
 
-def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = make_told) -> int:
+def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | None = None) -> int:
     """
     Execute a command line.
 
     :param args: command line without the program's name; None: that of the process.
+    :param make_simulator: makes the engine; None: `told.make_told` does.
     :returns: exit code: 0; 2, with one line on stderr, if an input cannot be used or something cannot
         be written; 130 or 143 if SIGINT (Ctrl-C) or SIGTERM arrived before there was anything to
         report, or before an experiment was complete.
@@ -73,8 +58,10 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory = m
         if words[0] not in VERBS and not words[0].startswith('-'):
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
                              meant(words[0], VERBS, f'see {PROGRAM} --help'))
-        chosen = _parser(words).parse_args(dashed(words))
-        code: int = chosen.act(chosen, make_simulator)
+        chosen = _parser(words).parse_args(words)
+        from dlo_calibration.cli.told import make_told
+
+        code: int = chosen.act(chosen, make_simulator or make_told)
         return code
     except DloCalibrationError as error:
         tell(f'{PROGRAM}: {" ".join(str(error).split())}')
@@ -92,6 +79,8 @@ class _Help(argparse.HelpFormatter):
 
     def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: Any = None) -> None:
         """Leave the options out."""
+        from dlo_calibration.cli.options import PREFIX
+
         super().add_usage(usage, [one for one in actions if not one.dest.startswith(PREFIX)], groups, prefix)
 
 
@@ -99,10 +88,14 @@ class _Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line, and names the flag that was probably meant."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse a flag that this verb does not have."""
-        chosen, rest = super().parse_known_args(args, namespace)
+        """Refuse a flag that this verb does not have; one may be typed with underscores."""
+        if self.prog == PROGRAM:
+            return super().parse_known_args(args, namespace)
+        from dlo_calibration.cli.options import dashed
+
+        chosen, rest = super().parse_known_args(dashed(args), namespace)
         strange = [word.partition('=')[0] for word in rest if word.startswith('--')]
-        if strange and self.prog != PROGRAM:
+        if strange:
             hint = meant(strange[0], self._option_string_actions, '')
             self.error(f'unrecognized arguments: {" ".join(rest)}{"; " if hint else ""}{hint}')
         return chosen, rest
@@ -112,14 +105,14 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser; only a verb that is among the words has its arguments, as there are hundreds."""
+    """Return the parser; only a verb that is among the words is loaded, and has its arguments."""
     parser = _Parser(prog=PROGRAM, allow_abbrev=False, description=(
         'Find the physical parameters of a rope, cable, wire or hose from recorded manipulations.'))
     verbs = parser.add_subparsers(required=True, metavar='VERB')
-    for name, verb in VERBS.items():
-        added = verbs.add_parser(name, help=verb.TEXT, description=verb.TEXT, allow_abbrev=False,
-                                formatter_class=_Help)
-        added.set_defaults(act=verb.act)
+    for name, text in VERBS.items():
+        added = verbs.add_parser(name, help=text, description=text, allow_abbrev=False, formatter_class=_Help)
         if name in words:
+            verb = module_of(name)
+            added.set_defaults(act=verb.act)
             verb.add_arguments(added)
     return parser

@@ -9,11 +9,12 @@ from contextlib import contextmanager, suppress
 import json
 import os
 import sys
-from typing import Any, Iterator, Mapping, Sequence, TextIO
+from typing import Any, Iterator, Mapping, Sequence, TextIO, TYPE_CHECKING
 
-from dlo_calibration.calibration.plain import known, plain
-from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError, printable
+
+if TYPE_CHECKING:
+    from dlo_calibration.calibration.result import CalibrationResult
 
 
 def tell(text: str) -> None:
@@ -51,6 +52,8 @@ def standard_output() -> Iterator[TextIO]:
 
 def print_json(value: Mapping[str, Any]) -> None:
     """Print one JSON document, with null for numbers that are not finite."""
+    from dlo_calibration.calibration.plain import known
+
     with standard_output() as stream:
         json.dump(known(value), stream, indent=2, allow_nan=False)
         stream.write('\n')
@@ -63,6 +66,7 @@ def print_result(result: CalibrationResult, as_json: bool, told: Sequence[str] =
     :param told: warnings that have been printed already.
     :raises DloCalibrationError: if stdout cannot be written.
     """
+    from dlo_calibration.calibration.plain import plain
     from dlo_calibration.report import terminal
 
     for warning in result.warnings:

@@ -23,7 +23,6 @@ from dlo_calibration.planning.planner import plan
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import make_folder
 
-TEXT = 'find actions that bring a calibrated DLO from one configuration to another'
 #: The options that a simulation needs.
 SIMULATION = ('engine', 'table', 'table_height', 'scene', 'nodes', 'time_step', 'stable_distance',
               'stable_time', 'settle_limit', 'answer_limit')

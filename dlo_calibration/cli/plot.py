@@ -15,8 +15,6 @@ from dlo_calibration.cli.source import add_source, read_result_file, read_source
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError
 
-TEXT = 'draw a picture of each trial, as measured and as simulated with a result'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""

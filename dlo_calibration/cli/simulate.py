@@ -33,7 +33,6 @@ from dlo_calibration.planning.prediction import DRAWS, Prediction, simulate
 from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.writing import make_folder
 
-TEXT = 'predict what a calibrated DLO does in the actions of a session or a request'
 MOST_DRAWS = 10_000
 Named = Sequence[tuple[str, Prediction]]  # names of trials, which can be anything, and what happens there
 USED = (*SIMULATION, 'grip_tolerance', 'length_tolerance', 'release')  # options

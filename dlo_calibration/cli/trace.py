@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # they load OpenCV, which other verbs do not need
     from dlo_calibration.capture.scale import Scale
     from dlo_calibration.capture.trace import Trace
 
-TEXT = "find a DLO's middle line in a photograph from a few rough clicks, and with a scale its chain"
 LARGEST_DIAMETER = 0.2  # m
 COUNTS = (3, MOST_POINTS)  # of a chain's points
 

@@ -25,8 +25,6 @@ from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.observation.rest_lengths import with_shared_places
 
-TEXT = 'simulate a session with the parameters of a result, without fitting'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""

@@ -12,8 +12,6 @@ import time
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output, tell
 
-TEXT = 'compile everything for this machine, ahead of the first use'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""

@@ -3,6 +3,7 @@
 
 """The choice of an engine: what each name gives, what it refuses, and what is told."""
 
+import copy
 import logging
 
 import pytest
@@ -48,7 +49,7 @@ def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
 
 def test_bullet_is_one_option_away(notices):
     simulator = make_simulator(Options(engine='bullet'))
-    assert type(simulator) is BulletSimulator
+    assert type(copy.copy(simulator)) is BulletSimulator
     assert simulator.name == 'bullet'
     assert notices() == []
 

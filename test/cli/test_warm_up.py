@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dlo_calibration.calibration.options import Options
 
-main = import_module('dlo_calibration.cli.main')
+told = import_module('dlo_calibration.cli.told')
 
 
 def test_a_second_time_it_is_all_there(command):
@@ -23,11 +23,11 @@ def test_a_second_time_it_is_all_there(command):
 
 def test_a_verb_tells_that_it_compiles_before_it_does(monkeypatch, capsys):
     done = []
-    monkeypatch.setattr(main, 'is_compiled', lambda module: module in dict(done))
-    monkeypatch.setattr(main, 'compile_kernels',
+    monkeypatch.setattr(told, 'is_compiled', lambda module: module in dict(done))
+    monkeypatch.setattr(told, 'compile_kernels',
                         lambda module: done.append((module, capsys.readouterr().err)))
     for _ in range(2):
-        main.make_told(Options()).close()
-    assert [told for _, told in done] == [
+        told.make_told(Options()).close()
+    assert [text for _, text in done] == [
         f'compiling the {what} for this machine, once, about half a minute\n'
         for what in ('simulation', 'simulation of several trials at once')]

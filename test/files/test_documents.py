@@ -71,9 +71,9 @@ def test_every_verb_is_documented_with_its_own_flags():
     first, common, *verbs = text.split('\n## ')
     told = {text.partition('\n')[0]: text for text in verbs}
     assert set(told) == set(main.VERBS) == set(re.findall('^\\| \\[`(.*?)`\\]', first, re.MULTILINE))
-    for verb, module in main.VERBS.items():
+    for verb in main.VERBS:
         parser = argparse.ArgumentParser(add_help=False)
-        module.add_arguments(parser)
+        main.module_of(verb).add_arguments(parser)
         for flag in (action for action in parser._actions if not action.dest.startswith(PREFIX)):
             for word in flag.option_strings or [flag.metavar]:
                 assert word in f'{told[verb]}{common}', f'{verb} {word}'
