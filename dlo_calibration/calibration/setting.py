@@ -76,7 +76,7 @@ class Setting:
 
     @cached_property
     def _alone(self) -> Simulator:
-        """The engine, in a process of its own where others simulate evaluations: this one loads no kernels."""
+        """The engine, in a process of its own if others simulate evaluations: this one loads no kernels."""
         if self.executor is None:
             return self.simulator
         return SimulatorApart(self.simulator, 'trials', self.options.answer_limit)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
-from contextlib import closing
+from contextlib import closing, ExitStack
 from dataclasses import replace
 import time
 from typing import Callable
@@ -22,6 +22,7 @@ from dlo_calibration.evaluation.ahead import SimulatedAhead
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.processes import cores, ProcessExecutor
 from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.inference.advice import advise
 from dlo_calibration.inference.confirmation import Confirmation, disagreements
@@ -136,13 +137,18 @@ def _confirmed(result: CalibrationResult, simulator: Simulator,
 def sliced(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
            should_stop: Callable[[], bool] = lambda: False) -> Slices | None:
     """
-    Simulate slices around a result, in this thread; None if the engine fails.
+    Simulate slices around a result, in as many processes as `options` say; None if the engine fails.
 
     The time for them is limited, so that they may be coarse: see `slices.simulate_slices`.
     """
     try:
-        with closing(make_simulator(options)) as simulator:
+        with ExitStack() as stack:
+            simulator = stack.enter_context(closing(make_simulator(options)))
+            workers, executor = options.workers or cores(), None
+            if workers > 1:
+                executor = stack.enter_context(closing(
+                    ProcessExecutor(workers, answer_limit=options.answer_limit)))
             return simulate_slices(Evaluator(result.trials, result.space, simulator), result.best, result.std,
-                                   result.examination, should_stop=should_stop)
+                                   result.examination, executor=executor, should_stop=should_stop)
     except Exception:  # the page is written even if the engine fails
         return None

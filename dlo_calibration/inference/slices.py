@@ -5,14 +5,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Executor
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 import time
-from typing import Callable, Iterator, Sequence
+from typing import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.inference.examination import Examination
@@ -76,28 +77,32 @@ class Slices:
 
 
 def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examination: Examination | None, *,
-        seconds: float = MOST_SECONDS, should_stop: Callable[[], bool] = lambda: False,
-        clock: Callable[[], float] = time.monotonic) -> Slices:
+        executor: Executor | None = None, seconds: float = MOST_SECONDS,
+        should_stop: Callable[[], bool] = lambda: False, clock: Callable[[], float] = time.monotonic
+        ) -> Slices:
     """
     Simulate slices around the found values, coarse ones first, until the time is up.
 
     :param best: the evaluation of the found values.
     :param std: (d,) their standard deviations in the unit cube.
     :param examination: of their surroundings; None if there was none.
+    :param executor: simulates them; None: this thread does.
     :param seconds: time limit [s].
     :param should_stop: asked between trials; once True, the slices so far are returned.
     :param clock: the time [s].
     """
     end = clock() + seconds
-    grid = _Grid(evaluator, best, std, lambda: should_stop() or clock() > end)
+    grid = _Grid(BatchEvaluator(evaluator, lambda: should_stop() or clock() > end, executor), best, std)
     dimension, varied = evaluator.space.dimension, chosen(evaluator.space.free, std)
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()
     try:
         for level in LEVELS:
+            # A plane of 16 intervals would take four times as long.
+            drawn = pairs(dimension, examination) if level <= 8 else []
+            grid.simulate(varied, drawn, level)
             lines = tuple(grid.line(k, level) for k in varied)
-            if level <= 8:  # a plane of 16 intervals would take four times as long
-                planes = tuple(grid.plane(pair, level) for pair in pairs(dimension, examination))
+            planes = tuple(grid.plane(pair, level) for pair in drawn) or planes
     except CancelledError:
         return Slices(lines, planes, grid.count, False)
     return Slices(lines, planes, grid.count, True)
@@ -124,19 +129,30 @@ def pairs(dimension: int, examination: Examination | None) -> list[tuple[int, in
 class _Grid:
     """The points of the slices, each evaluated once; a slice extends 4 standard deviations to each side."""
 
-    def __init__(self, evaluator: Evaluator, best: Evaluation, std: Floats, late: Callable[[], bool]) -> None:
-        self._evaluator, self._late = evaluator, late
+    def __init__(self, evaluate: BatchEvaluator, best: Evaluation, std: Floats) -> None:
+        self._evaluate = evaluate
         self._best = best
         reach = np.maximum(4.0 * std, NARROWEST / SCALE)
         self._ends = [(max(0.0, value - one), min(1.0, value + one))
                       for value, one in zip(best.point.tolist(), reach.tolist(), strict=True)]
         self._seen: dict[tuple[float, ...], Evaluation] = {}
-        self._names = evaluator.space.free
+        self._names = evaluate.evaluator.space.free
 
     @property
     def count(self) -> int:
         """Number of simulated points."""
         return len(self._seen)
+
+    def simulate(self, varied: Sequence[int], drawn: Sequence[tuple[int, int]], level: int) -> None:
+        """Simulate what lines and planes need, as far as there is time, those of the lines first."""
+        changed = [{k: float(value)} for k in varied for value in self._values(k, level)]
+        changed += [dict(zip(pair, map(float, values), strict=True)) for pair in drawn
+                    for values in product(*(self._values(k, level) for k in pair))]
+        known = {tuple(self._best.point.tolist()), *self._seen}
+        new = [point for point in dict.fromkeys(map(self._key, changed)) if point not in known]
+        if new:
+            for point, evaluation in zip(new, self._evaluate(np.array(new), 0), strict=False):
+                self._seen[point] = evaluation
 
     def line(self, k: int, level: int) -> Line:
         """Vary one parameter; its values include the found one."""
@@ -157,18 +173,21 @@ class _Grid:
         low, high = self._ends[k]
         return np.linspace(low, high, level + 1)
 
-    def _at(self, changes: dict[int, float]) -> Evaluation:
-        point = self._best.point.copy()
-        for k, value in changes.items():
-            point[k] = value
-        if np.array_equal(point, self._best.point):
+    def _key(self, changes: Mapping[int, float]) -> tuple[float, ...]:
+        return tuple(changes.get(k, value) for k, value in enumerate(self._best.point.tolist()))
+
+    def _at(self, changes: Mapping[int, float]) -> Evaluation:
+        """
+        Return the evaluation of the best point with changes.
+
+        :raises CancelledError: if there was no time for it.
+        """
+        point = self._key(changes)
+        if point == self._key({}):
             return self._best
-        key = tuple(point.tolist())
-        if key not in self._seen:
-            if self._late():
-                raise CancelledError
-            self._seen[key] = self._evaluator.evaluate(0, point, self._late)
-        return self._seen[key]
+        if point not in self._seen:
+            raise CancelledError
+        return self._seen[point]
 
 
 def _outcomes(found: Sequence[Evaluation]) -> Iterator[Floats]:
