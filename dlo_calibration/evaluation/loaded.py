@@ -19,6 +19,8 @@ sys.path[:] = filter(None, sys.path)  # not the folder in which the user works: 
 with suppress(Exception):
     from dlo_calibration.simulation.kernel_cache import is_compiled, SIMULATION, TOGETHER
 
+    for _module in ('batch', 'unmade'):  # what the first call of each process would load
+        import_module(f'dlo_calibration.evaluation.{_module}')
     for _kernels, _user in ((SIMULATION, 'dlo_calibration.simulation.compiled'),
                             (TOGETHER, 'dlo_calibration.simulation.together')):
         if is_compiled(_kernels):

@@ -17,11 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 import os
 from pathlib import Path
-from typing import Iterator, Mapping
+from typing import Iterator, Mapping, TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Floats, frozen_array
@@ -32,6 +31,9 @@ from dlo_calibration.simulation.mesh import (
     open_regular,
     read_mesh,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 # Each is about ten times what a robot cell needs; then reading takes seconds and some 100 MB at most.
 MOST_BYTES = 8 * 2**20  # of the URDF file
@@ -168,6 +170,8 @@ class _Reader:
 
     def _frame(self, name: str) -> tuple[Floats, Rotation]:
         """Return the position (3,) [m] and the rotation of a link."""
+        from scipy.spatial.transform import Rotation  # slow to load
+
         waiting: list[str] = []  # links from this one towards the root
         while name not in self._frames and name in self._joints:
             waiting.append(name)
@@ -181,6 +185,8 @@ class _Reader:
 
     def _origin(self, element: ElementTree.Element) -> tuple[Floats, Rotation]:
         """Return the position (3,) [m] and the rotation in the <origin> of an element."""
+        from scipy.spatial.transform import Rotation
+
         origin = element.find('origin')
         if origin is None:
             return np.zeros(3), Rotation.identity()
