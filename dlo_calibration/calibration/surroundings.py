@@ -56,13 +56,16 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     finer = setting.simulator.refined()
     noisy = sigma > NO_NOISE and 'length_scale' not in space.free
     evaluate = setting.evaluate(space)
+    drawn = with_other_noise(
+        trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0)) if noisy else []
+    here = best.point[None, :]
     try:
+        # They begin first, as they depend on nothing that follows: processes that would wait do them.
+        fine = None if finer is None else setting.evaluate(space, finer=finer).begin(here)
+        starts = [setting.evaluate(space, others).begin(here) for others in drawn]
         examination = examine(
             best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
-            default=default, noise=sigma,
-            finer=None if finer is None else setting.evaluate(space, finer=finer).residuals,
-            starts=[setting.evaluate(space, others).residuals for others in with_other_noise(
-                trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0))] if noisy else [],
+            default=default, noise=sigma, finer=fine, starts=starts,
             fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:

@@ -15,7 +15,7 @@ import math
 import pickle
 import queue
 import threading
-from typing import Callable, Iterator, Sequence
+from typing import Callable, Iterator, Mapping, Sequence
 import uuid
 import weakref
 
@@ -60,8 +60,10 @@ class BatchEvaluator:
     def __call__(self, points: Floats, first: int) -> Iterator[Evaluation]:
         """Yield the evaluations of (k, d) points; the first one has the index `first`."""
         if self._executor is not None:
-            yield from self._in_parallel(points, first, self._executor)
-            return
+            return self._in_parallel(points, first, self._executor)
+        return self._here(points, first)
+
+    def _here(self, points: Floats, first: int) -> Iterator[Evaluation]:
         known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
         for k, evaluation in enumerate(known):
             if evaluation is None:
@@ -88,6 +90,7 @@ class BatchEvaluator:
         return max(1, min(wanted, points // getattr(self._executor, 'workers', 1)))
 
     def _in_parallel(self, points: Floats, first: int, executor: Executor) -> Iterator[Evaluation]:
+        """Begin at once; return an iterator that waits."""
         known = [self._memory.find(index, point) for index, point in enumerate(points, first)]
         new, size = [k for k, one in enumerate(known) if one is None], self._portion(len(points))
         futures: dict[int, tuple[Future[list[Evaluation]], int]] = {}  # and the place in its answer
@@ -96,6 +99,11 @@ class BatchEvaluator:
             future = executor.submit(_evaluate_in_worker, self._key, self._parcel, self.evaluator.space,
                                      [(first + k, points[k]) for k in portion])
             futures.update({k: (future, place) for place, k in enumerate(portion)})
+        return self._finished(known, futures)
+
+    def _finished(self, known: Sequence[Evaluation | None],
+                  futures: Mapping[int, tuple[Future[list[Evaluation]], int]]) -> Iterator[Evaluation]:
+        """Yield what is known and what the futures give, at its place in their answers."""
         finished: queue.SimpleQueue[Future[list[Evaluation]]] = queue.SimpleQueue()
         waiting = {future for future, _ in futures.values()}
         for future in waiting:
@@ -131,10 +139,19 @@ class BatchEvaluator:
 
         :raises CancelledError: when stopped.
         """
-        found = [evaluation.residuals for evaluation in self(points, 0)]
-        if len(found) < len(points):
-            raise CancelledError
-        return found
+        return self.begin(points)()
+
+    def begin(self, points: Floats) -> Callable[[], Sequence[Floats | None]]:
+        """Begin to evaluate (k, d) points, if an executor does that; return what gives their `residuals`."""
+        under_way = self(points, 0)
+
+        def ended() -> Sequence[Floats | None]:
+            found = [evaluation.residuals for evaluation in under_way]
+            if len(found) < len(points):
+                raise CancelledError
+            return found
+
+        return ended
 
 
 class _Parcel:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Sequence
+from typing import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ from dlo_calibration.inference.uncertainty import (
 )
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
+
+#: Gives the residuals (m,) [m] of points that are being evaluated, None for a failure.
+Ended = Callable[[], Sequence[Floats | None]]
 
 #: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
 SUSPECT = 0.01
@@ -71,16 +74,16 @@ class Examination:
 
 
 def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: Evaluate, *,
-            default: Floats, noise: float, finer: Evaluate | None = None,
-            starts: Sequence[Evaluate] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
+            default: Floats, noise: float, finer: Ended | None = None,
+            starts: Sequence[Ended] = (), fading: NDArray[np.bool_] | None = None) -> Examination:
     """
     Examine the (d,) `point` of the unit cube, where the residuals are `residuals` (m,) [m].
 
     :param evaluate: simulates the trials.
     :param default: (d,) the default parameters.
     :param noise: noise level, see `Examination` [m].
-    :param finer: simulates with more nodes and a smaller step; None: this is left out.
-    :param starts: each simulates with initial chains of other noise; may be empty.
+    :param finer: gives the residuals at `point` with more nodes and a smaller step; None: this is left out.
+    :param starts: each gives those with initial chains of other noise; may be empty.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
     """
@@ -96,11 +99,11 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     fit = _linearised(point, residuals, layout, residuals_at, noise, fading)
     fold_errors = left_out_errors(fit, layout, residuals_at)
     shift = None
-    if finer is not None:  # late, because a worker keeps one simulator at a time
+    if finer is not None:
         count += 1
-        fine, = finer(point[None, :])
+        fine, = finer()
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
-    drawn = [one for start in starts for one in start(point[None, :])]
+    drawn = [one for start in starts for one in start()]
     count += len(drawn)
     found = at_minimum(fit, layout, noise=noise, shift=shift,
                        starts=[one for one in drawn if one is not None])

@@ -3,6 +3,8 @@
 
 """What is found around a point, on models whose answer is known."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -50,9 +52,11 @@ def optimum(model, rows=slice(None)):
     return TRUTH - np.linalg.lstsq(model.jacobian[rows], model.errors[rows], rcond=None)[0]
 
 
-def examined(model, point=None, **rest):
+def examined(model, point=None, finer=None, starts=(), **rest):
     point = optimum(model) if point is None else point
-    return examine(point, model.at(point), LAYOUT, model, default=DEFAULT, noise=NOISE, **rest)
+    fine, *others = (None if one is None else partial(one, point[None, :]) for one in (finer, *starts))
+    return examine(point, model.at(point), LAYOUT, model, default=DEFAULT, noise=NOISE, finer=fine,
+                   starts=others, **rest)
 
 
 def test_the_jacobian_of_a_linear_model_is_recovered():
