@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Measure how long commands take to start, and which slow modules they load: `make bench`."""
+"""Measure how long commands take to start, what they load, and when `fit` shows what: `make bench`."""
 
 from importlib.util import find_spec
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ COMMANDS = {
     'calibrator --help': ('dlo_calibration.ros.calibrator', '--help'),
     'calibrator, until it is ready': ('dlo_calibration.ros.calibrator',),
 }
+FIT = ('first evaluation', 'result printed', 'page and all files written')
 READY = 'collecting trials'  # says the node
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
 PATIENCE = 60  # s
@@ -44,6 +46,22 @@ def finish(words, *options):
     return said
 
 
+def fit(folder):
+    """Return the seconds after which `fit` of the sample has done what FIT lists."""
+    log, begun, times = Path(folder) / 'unfinished/evaluations.log', time.perf_counter(), []
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'dlo_calibration', 'fit', str(SAMPLES / 'object1'), '--output', str(folder)],
+        env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not (log.exists() and b'evaluation-' in log.read_bytes()):
+        time.sleep(0.005)
+    times.append(time.perf_counter() - begun)
+    process.stdout.readline()
+    times.append(time.perf_counter() - begun)
+    process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    return [*times, time.perf_counter() - begun]
+
+
 @pytest.fixture(scope='module')
 def rows():
     """Collect the rows, and write the table."""
@@ -51,7 +69,8 @@ def rows():
     yield found
     if found:
         write('startup', 'make bench', f'Wall clock from the start of the process; shortest of {ROUNDS} '
-              f'repetitions. Loaded of {", ".join(SLOW)}, as `python -X importtime` says.',
+              f'repetitions, after one that compiles the kernels if they are not. Loaded of '
+              f'{", ".join(SLOW)}, as `python -X importtime` says.',
               table(['command', 'seconds', 'loads'], found))
 
 
@@ -71,3 +90,10 @@ def test_startup(benchmark, name, rows, tmp_path, monkeypatch):
     *lines, _ = finish(words, '-X', 'importtime')
     loaded = {line.rpartition('|')[2].strip() for line in lines}
     rows.append([name, f'{min(times[1:]):.2f}', ', '.join(one for one in SLOW if one in loaded) or 'none'])
+
+
+def test_fit(benchmark, rows, tmp_path):
+    times = []
+    benchmark.pedantic(lambda: times.append(fit(tmp_path / f'{len(times)}')), rounds=ROUNDS, warmup_rounds=1)
+    for name, seconds in zip(FIT, zip(*times[1:], strict=True), strict=True):
+        rows.append([f'dlo-calibration fit SESSION, {name}', f'{min(seconds):.2f}', ''])
