@@ -9,11 +9,13 @@ from dataclasses import replace
 
 from dlo_calibration.calibration.options import Options
 
-LEAST_NODES = 21  # of a coarse DLO; with fewer, a plan is not found faster
+SHARE = 3 / 4  # of the segments and of the steps; with less, plans end further from their goals
+LEAST_NODES = 21  # of a coarse DLO
 LONGEST_STEP = 0.01  # s, of a coarse simulation
 
 
 def coarser(options: Options) -> Options:
-    """Return options with half the segments and twice the time step, within limits."""
-    return replace(options, nodes=min(options.nodes, max(options.nodes // 2 + 1, LEAST_NODES)),
-                   time_step=max(options.time_step, min(2 * options.time_step, LONGEST_STEP)))
+    """Return options with SHARE of the segments and of the time steps, within limits."""
+    nodes = max(round(SHARE * (options.nodes - 1)) + 1, LEAST_NODES)
+    step = min(options.time_step / SHARE, LONGEST_STEP)
+    return replace(options, nodes=min(options.nodes, nodes), time_step=max(options.time_step, step))
