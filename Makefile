@@ -78,6 +78,7 @@ soak: $(STAMP)
 
 figures: bench
 	@$(PYTHON) benchmark/searches.py
+	$(PYTHON) benchmark/ladder.py
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) benchmark/first_day.py
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
