@@ -11,17 +11,22 @@ from dlo_calibration.signals import end_at_signals, StopFlag
 NAME = 'dlo_calibration'
 
 
+def _begin_to_load() -> None:
+    """Let processes that are going to simulate load the kernels while this one reads its input."""
+    from dlo_calibration.evaluation.processes import begin_to_load, cores
+
+    if cores() > 1 and not any(word.startswith('--workers') for word in sys.argv):
+        begin_to_load()
+
+
 def main() -> int:
     """Execute the command line of the process; return the exit code, as `cli.main.main` does."""
     end_at_signals('dlo-calibration')
     # Where they were closed by whoever started the process, Python has none.
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:
-        if sys.argv[1:2] == ['fit'] and not any(word.startswith('--workers') for word in sys.argv):
-            from dlo_calibration.evaluation.processes import begin_to_load, cores
-
-            if cores() > 1:
-                begin_to_load()
+        if sys.argv[1:2] == ['fit'] and any(map(os.path.exists, sys.argv[2:])):
+            _begin_to_load()
         from dlo_calibration.cli.main import main as execute
         from dlo_calibration.cli.output import flush
 

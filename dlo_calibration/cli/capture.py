@@ -108,10 +108,10 @@ def serve_page(chosen: argparse.Namespace, make_simulator: SimulatorFactory,
 
 def _compiled(stack: ExitStack, should_stop: Callable[[], bool]) -> Compiling:
     """Wait until the tracer is compiled; return the compilation of the simulation, which goes on."""
-    from dlo_calibration.evaluation.compiling import Compiling
+    from dlo_calibration.evaluation.compiling import Compiling, load
     from dlo_calibration.simulation.kernel_cache import TRACER
 
-    tracer, simulation = Compiling(TRACER), Compiling()
+    tracer, simulation = Compiling(TRACER), Compiling(then=lambda: load(0))
     for one in (tracer, simulation):
         stack.callback(one.close)
         one.begin()

@@ -12,7 +12,7 @@ import time
 from typing import Callable, Iterator
 
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation.processes import begin_to_load, cores, ProcessExecutor
 from dlo_calibration.simulation.kernel_cache import (
     compile_kernels,
     is_compiled,
@@ -110,6 +110,18 @@ class Compiling:
         finally:
             with suppress(RuntimeError):
                 self._executor.close()
+
+
+def load(workers: int) -> None:
+    """
+    Load the kernels where the first calibration needs them: for its processes, or in this one if it has none.
+
+    :param workers: number of processes; 0: one per core.
+    """
+    if (workers or cores()) > 1:
+        begin_to_load()
+    else:
+        compile_kernels(SIMULATION)
 
 
 def _words(module: str) -> str:

@@ -22,7 +22,7 @@ from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
-from dlo_calibration.evaluation.compiling import Compiling
+from dlo_calibration.evaluation.compiling import Compiling, load
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import TrialCollector
@@ -76,7 +76,7 @@ class CalibrationSession:
         return self.collecting.collector
 
     def _load(self) -> None:
-        self._make_simulator(self.collecting.options).close()  # in a thread: delays no answer by over 0.1 s
+        load(self.collecting.options.workers)  # in a thread: delays no answer by over 0.1 s
         gc.freeze()  # what is loaded stays for ever; each search for garbage in it would take 0.2 s
 
     @property
