@@ -60,7 +60,7 @@ setup(
     ],
     extras_require={
         'bench': [
-            'mujoco>=3.2,<4',
+            'mujoco>=3.2',
             'pytest>=7.4',
             'pytest-benchmark>=4.0',
         ],
