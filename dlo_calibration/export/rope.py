@@ -250,7 +250,8 @@ def _assumed(found: CalibratedDlo, physical: Mapping[str, float], chain: Chain) 
     change = abs(chain.length - found.length) / found.length
     if change > LENGTH_TOLERANCE:
         remarks.append(f'the chain is {chain.length:.4g} m long, {100 * change:.0f} % from the '
-                       f'{found.length:.4g} m of the calibrated DLO: check that both are the same DLO')
+                       f'{found.length:.4g} m of the calibrated DLO: check that both are the same DLO, in '
+                       'metres')
     return remarks
 
 

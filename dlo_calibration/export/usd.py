@@ -156,6 +156,8 @@ def _about(rope: ExportedRope, moduli: bool) -> list[str]:
                      'has the mean of pieces that bend one after the other.')
     lines.append('Newton before 1.8 does not simulate the rest shape: the DLO is free of stress as it lies '
                  'at the start. So start there with a chain that nothing bends.')
+    lines.append('SolverVBD needs short steps and many iterations, and has no friction against rolling: see '
+                 'doc/export.md.')
     lost = [f'drag, {measured(rope.drag, "1/s")}']
     if moduli:
         lost.append(f'internal damping, {measured(rope.internal_damping, "s")}; twist')

@@ -89,7 +89,8 @@ def test_an_unknown_mass_is_said():
 
 
 def test_a_chain_of_another_dlo_is_doubted():
-    assert any('same DLO' in remark for remark in ExportedRope.of(MadeUpDlo(), straight(length=0.9)).remarks)
+    remarks = ExportedRope.of(MadeUpDlo(), straight(length=0.9)).remarks
+    assert any('same DLO, in metres' in remark for remark in remarks)
 
 
 def test_the_level_is_that_of_the_table():
