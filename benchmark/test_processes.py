@@ -92,6 +92,8 @@ def test_processes(benchmark, engine, processes):
 
 PROGRAM = """
 import json, sys, time
+from dlo_calibration.__main__ import begin_to_load
+begin_to_load()  # first of all, as the command does
 from dlo_calibration.cli import fit, main as cli
 marks = {'imports': time.time()}
 calibrate = fit.calibrate

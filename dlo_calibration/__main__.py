@@ -11,12 +11,13 @@ from dlo_calibration.signals import end_at_signals, StopFlag
 NAME = 'dlo_calibration'
 
 
-def _begin_to_load() -> None:
-    """Let processes that are going to simulate load the kernels while this one reads its input."""
-    from dlo_calibration.evaluation.processes import begin_to_load, cores
+def begin_to_load() -> None:
+    """Let the processes that are going to simulate load the kernels while this one reads its input."""
+    from dlo_calibration.evaluation import processes
 
-    if cores() > 1 and not any(word.startswith('--workers') for word in sys.argv):
-        begin_to_load()
+    words = f'{" ".join(sys.argv)} '.replace('=', ' ')
+    if processes.cores() > 1 and ' --workers 1 ' not in words:
+        processes.begin_to_load()
 
 
 def main() -> int:
@@ -26,7 +27,7 @@ def main() -> int:
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:
         if sys.argv[1:2] == ['fit'] and any(map(os.path.exists, sys.argv[2:])):
-            _begin_to_load()
+            begin_to_load()
         from dlo_calibration.cli.main import main as execute
         from dlo_calibration.cli.output import flush
 
