@@ -128,8 +128,6 @@ def balance(points: Floats, places: Floats, part: Part, noise: float) -> Balance
 def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], windows: int,
                  noise: float) -> Balance | None:
     """Return the balance of a part in windows; knowledge about its last end is not used."""
-    from scipy.integrate import trapezoid  # takes half a second to load
-
     system = _System(along, first, pins, windows)
     freedom = sum(len(own) for own, _ in system.rows) * 3 - system.count
     if freedom < 6:  # too few measured coordinates beyond the unknowns
@@ -140,7 +138,7 @@ def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], w
     for step in range(6):  # alternately of the shape and the moments along it
         matrix, forces = system.columns(shape, tension)
         stretch = np.zeros((1, system.count))
-        stretch[0, 1] = trapezoid(tension, system.fine) * noise / (0.05 * along[-1])  # prior: 5 % strain
+        stretch[0, 1] = _integral(tension, system.fine)[-1] * noise / (0.05 * along[-1])  # prior: 5 % strain
         at = np.concatenate([own for own, _ in system.rows])
         right = np.concatenate([observed[at].ravel(), [0.0]])
         seen = np.concatenate([block[::system.each] for block in matrix])
@@ -163,7 +161,7 @@ def _fit_windows(observed: Floats, along: Floats, first: str, pins: list[int], w
     # 1.7: the shape along which moments are computed is noisy too.
     covariance = inverse * (1.7 * max(noise, error))**2
     load = float(solution[0])
-    pull = float(trapezoid(tension, system.fine))
+    pull = float(_integral(tension, system.fine)[-1])
     # The length along a chain has an error of 0.3 %.
     stretch_std = np.inf if pull <= 0 else float(np.hypot(np.sqrt(max(covariance[1, 1], 0)),
                                                           0.003 * along[-1] / pull))
@@ -203,8 +201,6 @@ class _System:
         :param tension: (F,) tension over weight per length [m].
         :returns: (f, 3, u) positions for each window; (F, 3, u) internal force over EI.
         """
-        from scipy.integrate import cumulative_trapezoid
-
         force = np.zeros((len(self.fine), 3, self.count))
         force[:, 2, 0] = self.fine  # weight, upwards
         for k, pin in enumerate(self._forces):
@@ -217,14 +213,21 @@ class _System:
         for number, (_, own) in enumerate(self.rows):
             s = self.fine[own] - self.fine[own.start]
             # Kirchhoff: M' = -t x N
-            moment = -cumulative_trapezoid(turn[own] @ force[own], s, axis=0, initial=0)
+            moment = -_integral(turn[own] @ force[own], s)
             if number or self._turned:
                 moment[:, :, column + 6:column + 9] = np.eye(3)
-            slope = cumulative_trapezoid(-turn[own] @ moment, s, axis=0, initial=0)
-            block = cumulative_trapezoid(slope, s, axis=0, initial=0)
-            block[:, :, 1] = cumulative_trapezoid(tension[own, None] * tangent[own], s, axis=0, initial=0)
+            slope = _integral(-turn[own] @ moment, s)
+            block = _integral(slope, s)
+            block[:, :, 1] = _integral(tension[own, None] * tangent[own], s)
             block[:, :, column:column + 3] = np.eye(3)
             block[:, :, column + 3:column + 6] = s[:, None, None] * np.eye(3)
             column += 9 if number or self._turned else 6
             blocks.append(block)
         return blocks, force
+
+
+def _integral(values: Floats, s: Floats) -> Floats:
+    """Return (n, ...) integrals of (n, ...) values from the first of (n,) places to each, by trapezoids."""
+    widths = np.diff(s).reshape(-1, *[1] * (values.ndim - 1))
+    parts = np.cumsum(widths * (values[1:] + values[:-1]) / 2, axis=0)
+    return np.concatenate([np.zeros_like(values[:1]), parts])  # SciPy's takes half a second to load
