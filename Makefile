@@ -81,6 +81,12 @@ figures: bench
 	$(PYTHON) benchmark/ladder.py
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) benchmark/first_day.py
+	if ! pkg-config --exists ignition-physics5 sdformat12 2>/dev/null; then
+	  echo 'Gazebo Fortress is not installed: the table export_sdf is not made again.'
+	elif [ -n "$(MEASURED)" ]; then $(PYTHON) benchmark/export_sdf.py build/fitted; fi
+	if ! $(PYTHON) -c 'import newton, pxr' 2>/dev/null; then
+	  echo 'Newton is not installed: the table export_newton is not made again.'
+	elif [ -n "$(MEASURED)" ]; then $(PYTHON) benchmark/export_newton.py build/fitted; fi
 	$(PYTHON) -m dlo_calibration experiment --output build/experiment >/dev/null
 	cp build/experiment/experiment.md benchmark/results/experiment.md
 	$(PYTHON) benchmark/worth.py --output build/experiment >/dev/null
