@@ -79,6 +79,7 @@ soak: $(STAMP)
 figures: bench
 	@$(PYTHON) benchmark/searches.py
 	$(PYTHON) benchmark/ladder.py
+	$(PYTHON) benchmark/export_mujoco.py
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) benchmark/first_day.py
 	if ! pkg-config --exists ignition-physics5 sdformat12 2>/dev/null; then

@@ -4,17 +4,20 @@
 """
 Compare an exported DLO in MuJoCo with the elastica, with this package's engine and with the measured chains.
 
-    python benchmark/export_mujoco.py [cantilever] [hanging] [trials] [--other] [--minute]
+    python benchmark/export_mujoco.py [cantilever] [hanging] [flexcomp] [trials] [minute] [--other]
 
 Each part is printed, and written to benchmark/results/export_mujoco_V_PART.md, where V is 3 or 4, the
 version of the MuJoCo that is installed:
 
 - cantilever: a horizontal one, whose first body is fixed, against the elastica from the middle of that body;
+  beside it our engine, whose first segment is clamped, against the elastica from the end of that segment;
 - hanging: a DLO that hangs from its first body, against what EA and the weight make it longer;
+- flexcomp: the same two, of MuJoCo's own deformable, which export does not write;
 - trials: each sample is calibrated, and its trials are replayed. Hands are mocap bodies, and a `connect`
   constraint between a hand and the site of a gripped point is active while the hand is closed. The DLO counts
   as stable as in this package's engines. With `--other`, so are the five other actions with the same objects,
-  which need DLO_DATA. With `--minute`, each sample lies on the table for a minute, too.
+  which need DLO_DATA;
+- minute: each sample lies on the table for a minute of simulated time.  It takes half an hour.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 import subprocess
 import sys
@@ -33,37 +37,49 @@ import figures
 from lxml import etree
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
-from scipy.integrate import solve_bvp
+from replays import distance, elastica, Floats, Grip, grips, LENGTH, MASS, OBJECTS
 
-from dlo_calibration import calibrate, Chain, export_mjcf, Options, read_result, read_session, Trial
+from dlo_calibration import (
+    Action,
+    calibrate,
+    Chain,
+    export_mjcf,
+    Goal,
+    Hand,
+    Options,
+    read_result,
+    read_session,
+    Trial,
+)
 from dlo_calibration.files.result import Description
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.rollout import Settling
 
-Floats = NDArray[np.float64]
-
-LENGTH, POINTS = 0.6, 21  # m
-MASS = 0.03  # kg
-SEGMENTS = (20, 40)
+POINTS = 21
+SEGMENTS = (20, 40, 60)
 STIFFNESSES = {1e-5: 'sample 3', 1e-4: 'sample 1', 1e-3: '', 2e-2: 'sample 5'}  # N m^2
 MASSES = {1e-5: 0.008, 2e-2: 0.35}  # kg, of the samples
 FALL = 6.0  # s, in which a cantilever comes to rest; then its tip may move by STILL in 0.1 s
 STILL = 1e-5  # m
 STRETCHES = (4.0, 90.0)  # EA, N
 DRAG = 4.0  # 1/s, so that what hangs comes to rest soon
+RADIUS, FLEX_SEGMENTS, FLEX_STIFFNESSES = 0.004, 40, (1e-3, 2e-2)  # m, -, N m^2, of flexcomps
+EDGES = {'': 'as documented', 'solref="0.004 1" solimp="0.99 0.9999 0.001"': 'stiff'}
 LONGEST = 6.0  # s, to wait for a stable DLO
-MINUTE = 60.0  # s
 #: Part -> what its table is, and the columns.
 PARTS = {
     'cantilever': ('Distance of the tip of a cantilever from the elastica, mm.', [
-        'EI, N m^2', 'mass, g', *(f'{one} segments' for one in SEGMENTS), '% of the length', 'EI, mass of']),
+        'EI, N m^2', 'mass, g', *(f'{one} segments' for one in SEGMENTS), '% of the length, 40',
+        'ours, 40 segments', 'EI, mass of']),
     'hanging': ('By how much a hanging DLO becomes longer.', ['EA, N', 'MuJoCo, mm', 'EA and weight, mm']),
+    'flexcomp': ("A flexcomp of one dimension instead, 40 edges, Young's modulus from EI: it has no EA.", [
+        'EI, N m^2', 'edges', 'tip of a cantilever from the elastica, mm', 'longer by its weight, mm']),
     'trials': ('Mean distance of the points, mm.', [
         'sample', 'trials', 'number', 'MuJoCo to measured', 'ours to measured', 'ratio',
-        'MuJoCo to ours', 'MuJoCo to measured in the worst trial', 'processor time of a second, s',
-        'moved in a minute at rest']),
+        'MuJoCo to ours', 'MuJoCo to measured in the worst trial', 'processor time of a second, s']),
+    'minute': ('How far the points of a DLO on the table move in a minute at rest, after its first second.', [
+        'sample', 'mean, mm', 'largest, mm']),
 }
 
 
@@ -117,26 +133,6 @@ def points_of(model: Any, state: Any) -> Floats:
     return np.array(state.site_xpos[[one for one in found if one >= 0]])
 
 
-def elastica(bending: float, mass: float, clamp: float) -> Floats:
-    """Return the tip, (3,) [m], of a cantilever that leaves its clamp at `clamp` [m] along x."""
-    load, free = mass / LENGTH * GRAVITY, LENGTH - clamp
-    s = np.linspace(0, free, 400)
-    shape = np.stack([0 * s, 0 * s, clamp + s, 0 * s])
-
-    def slope(share: float, s: Floats, y: Floats) -> Floats:
-        moment = share * load * (free - s) * np.cos(y[0])
-        return np.stack([y[1], moment / bending, np.cos(y[0]), np.sin(y[0])])
-
-    def ends(first: Floats, last: Floats) -> Floats:
-        return np.array([first[0], last[1], first[2] - clamp, first[3]])
-
-    for share in np.geomspace(min(1.0, bending / load / free**3), 1, 14):  # each begins with the one before
-        solved = solve_bvp(partial(slope, share), ends, s, shape, tol=1e-6, max_nodes=50000)
-        assert solved.success, solved.message
-        s, shape = solved.x, solved.y
-    return np.array([shape[2, -1], 0.0, -abs(shape[3, -1])])
-
-
 def cantilevers() -> Iterator[list[str]]:
     """Yield the rows of the table of cantilevers."""
     for bending, name in STIFFNESSES.items():
@@ -144,9 +140,49 @@ def cantilevers() -> Iterator[list[str]]:
             away = []
             for segments in SEGMENTS:
                 tip = at_rest(made_up(bending, 1e4, mass), np.array([1.0, 0, 0]), segments)[-1]
-                away.append(np.linalg.norm(tip - elastica(bending, mass, LENGTH / segments / 2)))
+                away.append(np.linalg.norm(tip - elastica(bending, LENGTH / segments / 2, mass)))
+            ours = ours_away(bending, mass, 40)
             yield [f'{bending:g}', f'{1e3 * mass:g}', *(f'{1e3 * one:.2f}' for one in away),
-                   f'{100 * away[-1] / LENGTH:.2f}', name]
+                   f'{100 * away[SEGMENTS.index(40)] / LENGTH:.2f}', f'{1e3 * ours:.2f}', name]
+
+
+def ours_away(bending: float, mass: float, segments: int) -> float:
+    """Return the distance of the tip from the elastica in our engine [m]; a hand clamps the first segment."""
+    chain = Chain(np.linspace(0, LENGTH, segments + 1)[:, None] * [1.0, 0, 0])
+    hand = Hand('clamp', (0, 1), [0.0, 0.01], np.zeros((2, 3)))
+    trial = Trial('falls', chain, (Action((hand,)),), (Goal(chain, FALL, stable=False, held_by=('clamp',)),))
+    engine = CompiledSimulator(table=False, nodes=segments + 1)
+    tip = engine.simulate(trial, made_up(bending, 1e4, mass).physical()).chains[0][-1]
+    return float(np.linalg.norm(tip - elastica(bending, LENGTH / segments, mass)))
+
+
+def flexcomps() -> Iterator[list[str]]:
+    """Yield the rows of the table of MuJoCo's own DLO, a `flexcomp` of one dimension."""
+    for edges, bending in product(EDGES, FLEX_STIFFNESSES):
+        expected = elastica(bending, LENGTH / FLEX_SEGMENTS / 2)
+        fallen, hanging = (flexcomp(edges, bending, turn) for turn in ('0 0 0', '0 90 0'))
+        longer = np.linalg.norm(np.diff(hanging, axis=0), axis=1).sum() - LENGTH
+        away = np.linalg.norm(fallen[-1] - fallen[0] - expected)
+        yield [f'{bending:g}', EDGES[edges], *(
+            'unstable' if not value < LENGTH else f'{1e3 * value:.1f}' for value in (away, longer))]
+
+
+def flexcomp(edges: str, bending: float, turn: str) -> Floats:
+    """Return the points, (FLEX_SEGMENTS + 1, 3) [m], of a flexcomp at rest; its first two are fixed."""
+    spacing, young = LENGTH / FLEX_SEGMENTS, bending / (np.pi / 4 * RADIUS**4)
+    # MuJoCo 4 takes the elasticity of flexcomps implicitly only with this integrator, which 3 has not.
+    integrator = 'discrete' if mujoco.__version__ >= '4' else 'implicitfast'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody><flexcomp name="dlo" '
+        f'type="grid" dim="1" count="{FLEX_SEGMENTS + 1} 1 1" spacing="{spacing} {spacing} {spacing}" '
+        f'euler="{turn}" radius="{RADIUS}" mass="{MASS}"><edge equality="true" {edges}/><elasticity '
+        f'young="{young}" poisson="0" damping="0.002"/><pin id="0 1"/><contact selfcollide="none"/>'
+        '</flexcomp></worldbody></mujoco>')
+    model.dof_damping[:] = DRAG * MASS / FLEX_SEGMENTS
+    state = mujoco.MjData(model)
+    mujoco.mj_step(model, state, round(FALL / model.opt.timestep))
+    points = np.array(state.flexvert_xpos)
+    return np.full_like(points, np.nan) if state.warning.number.any() else points
 
 
 def stretches() -> Iterator[list[str]]:
@@ -158,40 +194,35 @@ def stretches() -> Iterator[list[str]]:
         yield [f'{stretching:g}', f'{1e3 * longer:.2f}', f'{1e3 * expected:.2f}']
 
 
-def with_hands(text: str, trial: Trial) -> str:
-    """Return a file with the hands of a trial, which are open."""
+def with_hands(text: str, held: list[Grip]) -> str:
+    """Return a file with a hand for each grip, all open."""
     root = etree.fromstring(text.encode())
     equality = etree.SubElement(root, 'equality')
-    for hand, point in gripped(trial):
-        name = f'{hand.name}_{point}'
-        body = etree.SubElement(root.find('worldbody'), 'body', name=name, mocap='true')
-        etree.SubElement(body, 'site', name=name)
-        etree.SubElement(equality, 'connect', name=name, site1=name, site2=f'dlo_point_{point}',
-                         active='false', solref='0.004 1')
+    for k, grip in enumerate(held):
+        body = etree.SubElement(root.find('worldbody'), 'body', name=f'hand_{k}', mocap='true')
+        etree.SubElement(body, 'site', name=f'hand_{k}')
+        etree.SubElement(equality, 'connect', name=f'hand_{k}', site1=f'hand_{k}',
+                         site2=f'dlo_point_{grip.point}', active='false', solref='0.004 1')
     return etree.tostring(root, encoding='unicode')
-
-
-def gripped(trial: Trial) -> list[tuple[Any, int]]:
-    """Return each point that a hand grips, with the hand."""
-    return [(hand, point) for hand in trial.hands for point in hand.grips]
 
 
 def replayed(found: Any, trial: Trial, options: Options) -> tuple[Floats, float]:
     """Return the simulated points at the goal of a trial, (n, 3) [m], and the processor time of a second."""
-    model, state = started(with_hands(export_mjcf(found, trial.initial, options=options), trial))
-    goal, step, offsets = trial.goals[0], model.opt.timestep, {}
-    kept, since, begun = points_of(model, state), 0.0, time.process_time()
+    goal = trial.goals[0]
+    held, offsets = grips(trial, goal.time + LONGEST), dict[int, Floats]()
+    model, state = started(with_hands(export_mjcf(found, trial.initial, options=options), held))
+    step, kept, since, begun = model.opt.timestep, points_of(model, state), 0.0, time.process_time()
     while True:
-        for hand, point in gripped(trial):
-            name = f'{hand.name}_{point}'
-            if name not in offsets and hand.start <= state.time + step / 2:
-                offsets[name] = state.site(f'dlo_point_{point}').xpos - hand.positions_at(hand.start)[0]
-                state.eq_active[model.equality(name).id] = 1
-            if name in offsets:
-                state.mocap_pos[model.body(name).mocapid[0]] = \
-                    hand.positions_at(state.time + step)[0] + offsets[name]
-                if hand.end <= state.time + step / 2 and not trial.holds(hand, goal):
-                    state.eq_active[model.equality(name).id] = 0
+        for k, grip in enumerate(held):
+            constraint = model.equality(f'hand_{k}').id
+            if k not in offsets and grip.times[0] <= state.time + step / 2:
+                offsets[k] = state.site(f'dlo_point_{grip.point}').xpos - grip.positions[0]
+                state.eq_active[constraint] = 1
+            if k in offsets:
+                now = [np.interp(state.time + step, grip.times, axis) for axis in grip.positions.T]
+                state.mocap_pos[model.body(f'hand_{k}').mocapid[0]] = now + offsets[k]
+                if grip.times[-1] <= state.time + step / 2:
+                    state.eq_active[constraint] = 0
         mujoco.mj_step(model, state)
         assert not state.warning.number.any(), f'{trial.name}: MuJoCo warns that it is unstable'
         if state.time > goal.time and state.time - since >= Settling.time:
@@ -214,14 +245,9 @@ def trials_of(name: str, folder: Path, other: bool) -> Iterator[tuple[str, Trial
         yield 'other', trial
 
 
-def mean(one: Floats, other: Floats) -> float:
-    """Return the mean distance of points [mm]."""
-    return 1e3 * float(np.linalg.norm(one - other, axis=1).mean())
-
-
-def samples(folder: Path, other: bool, minute: bool) -> Iterator[list[str]]:
+def replays(folder: Path, other: bool) -> Iterator[list[str]]:
     """Yield a row for each sample and kind of trial: mean distances, MuJoCo's and ours."""
-    for name in (f'object{k}' for k in range(1, 6)):
+    for name in OBJECTS:
         session = read_session(figures.SAMPLES / name)
         found = calibrate(session.trials, replace(session.options, engine='compiled'))
         engine, rows = CompiledSimulator(), dict[str, list[tuple[float, ...]]]()
@@ -229,47 +255,51 @@ def samples(folder: Path, other: bool, minute: bool) -> Iterator[list[str]]:
             measured = trial.goals[0].chain.points
             ours = engine.simulate(trial, found.physical()).chains[0]
             theirs, share = replayed(found, trial, session.options)
-            row = mean(theirs, measured), mean(ours, measured), mean(theirs, ours), share
+            row = distance(theirs, measured), distance(ours, measured), distance(theirs, ours), share
             rows.setdefault(kind, []).append(row)
             print(name, kind, trial.name, *(f'{one:.2f}' for one in row), flush=True)
-        moved = lain(found, session.trials[0].initial, session.options) if minute else None
         for kind, all_of_kind in rows.items():
             table = np.array(all_of_kind)
             to_measured, ours_to, between, share = table.mean(axis=0)
             yield [name[-1], kind, str(len(table)), f'{to_measured:.2f}', f'{ours_to:.2f}',
                    f'{to_measured / ours_to:.2f}', f'{between:.2f}', f'{table[:, 0].max():.2f}',
-                   f'{share:.1f}', '-' if moved is None else f'{moved:.2f}']
+                   f'{share:.1f}']
 
 
-def lain(found: Any, chain: Chain, options: Options) -> float:
-    """Return how far the points move on average in a minute on the table, after its first second [mm]."""
-    model, state = started(export_mjcf(found, chain, options=options))
-    steps = round(MINUTE / model.opt.timestep)
-    mujoco.mj_step(model, state, steps // 60)
-    before = points_of(model, state)
-    mujoco.mj_step(model, state, steps - steps // 60)
-    assert not state.warning.number.any(), 'MuJoCo warns that it is unstable'
-    return mean(points_of(model, state), before)
+def minutes() -> Iterator[list[str]]:
+    """Yield a row for each sample: how far its points move in a minute."""
+    for name in OBJECTS:
+        session = read_session(figures.SAMPLES / name)
+        found = calibrate(session.trials, replace(session.options, engine='compiled'))
+        model, state = started(export_mjcf(found, session.trials[0].initial, options=session.options))
+        second = round(1 / model.opt.timestep)
+        mujoco.mj_step(model, state, second)
+        before = points_of(model, state)
+        mujoco.mj_step(model, state, 60 * second)
+        assert not state.warning.number.any(), f'{name}: MuJoCo warns that it is unstable'
+        now = points_of(model, state)
+        yield [name[-1], f'{distance(now, before):.3f}',
+               f'{1e3 * np.linalg.norm(now - before, axis=1).max():.3f}']
 
 
 def main() -> None:
     """Make the tables that the command line names, or all."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('parts', nargs='*', choices=[[], *PARTS], help='default: all')
+    parser.add_argument('parts', nargs='*', choices=[[], *PARTS], help='default: all but minute')
     parser.add_argument('--other', action='store_true', help='also other actions with the same objects')
-    parser.add_argument('--minute', action='store_true', help='also a minute on the table')
     chosen = parser.parse_args()
-    for part in chosen.parts or PARTS:
-        flags = [f' --{name}' for name in ('other', 'minute') if part == 'trials' and getattr(chosen, name)]
+    mujoco.set_mju_user_warning(lambda message: None)  # no log file; warnings are counted in the state
+    for part in chosen.parts or [name for name in PARTS if name != 'minute']:
+        other = ' --other' if part == 'trials' and chosen.other else ''
         with tempfile.TemporaryDirectory() as folder:
-            rows = cantilevers() if part == 'cantilever' else stretches() if part == 'hanging' else \
-                samples(Path(folder), chosen.other, chosen.minute)
+            rows = {'cantilever': cantilevers, 'hanging': stretches, 'flexcomp': flexcomps, 'minute': minutes,
+                    'trials': partial(replays, Path(folder), chosen.other)}[part]()
             text = figures.table(PARTS[part][1], rows)
         name = f'export_mujoco_{mujoco.__version__.split(".")[0]}_{part}'
         (figures.HERE / 'results' / f'{name}.md').write_text(
-            f'# {name}\n\n`python benchmark/export_mujoco.py {part}{"".join(flags)}`\n\n{PARTS[part][0]} '
-            f'MuJoCo {mujoco.__version__}, the form extensible, the time step of the file. '
+            f'# {name}\n\n`python benchmark/export_mujoco.py {part}{other}`\n\n{PARTS[part][0]} '
+            f'MuJoCo {mujoco.__version__}, steps of 2 ms. '
             f'{figures.machine()}\n\n{text}\n', encoding='utf-8')
         print(text, flush=True)
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
 
@@ -74,7 +75,7 @@ def compared(folder: Path, replay: Replay, most: int, names: Sequence[str] = OBJ
             theirs = replay(found, trial, grips(trial, end), end)
             measured = trial.goals[-1].chain.points
             for to, one, other in zip(away, (theirs, theirs, ours), (ours, measured, measured), strict=True):
-                to.append(1e3 * float(np.linalg.norm(one - other, axis=1).mean()))
+                to.append(distance(one, other))
             print(name, trial.name, *(f'{one[-1]:.2f}' for one in away), flush=True)
         rows.append([name[-1], *(f'{np.mean(one):.2f}' for one in away), f'{max(away[0]):.2f}',
                      f'{np.mean(away[1]) / np.mean(away[2]):.2f}'])
@@ -98,17 +99,26 @@ def cantilevers(tip: Callable[[float, int], Floats], cases: Iterator[tuple[float
     return table(['EI, N m²', 'segments', 'tip from the elastica, mm', '% of the length'], rows)
 
 
-def elastica(stiffness: float, clamp: float) -> Floats:
-    """Return the tip of a horizontal cantilever under its weight, (3,) [m] from where it is clamped."""
-    free, load = LENGTH - clamp, MASS / LENGTH * GRAVITY
+def distance(one: Floats, other: Floats) -> float:
+    """Return the mean distance of points, (n, 3) [m] each, in mm."""
+    return 1e3 * float(np.linalg.norm(one - other, axis=1).mean())
+
+
+def elastica(stiffness: float, clamp: float, mass: float = MASS) -> Floats:
+    """Return the tip of a horizontal cantilever under its weight, (3,) [m]; its clamp ends at x = `clamp`."""
+    free, load = LENGTH - clamp, mass / LENGTH * GRAVITY
     s = np.linspace(0, free, 400)
     shape = np.stack([0 * s, 0 * s, clamp + s, 0 * s])
-    for share in np.geomspace(1e-3, 1, 30):  # from an almost weightless one: a limp one needs a good start
-        def slope(at: Floats, y: Floats, load: float = share * load) -> Floats:
-            return np.stack([y[1], load * (free - at) * np.cos(y[0]) / stiffness, np.cos(y[0]), np.sin(y[0])])
 
-        solved = solve_bvp(slope, lambda a, b: np.array([a[0], b[1], a[2] - clamp, a[3]]), s, shape, tol=1e-6,
-                           max_nodes=50000)
+    def slope(share: float, at: Floats, y: Floats) -> Floats:
+        moment = share * load * (free - at) * np.cos(y[0])
+        return np.stack([y[1], moment / stiffness, np.cos(y[0]), np.sin(y[0])])
+
+    def ends(first: Floats, last: Floats) -> Floats:
+        return np.array([first[0], last[1], first[2] - clamp, first[3]])
+
+    for share in np.geomspace(min(1.0, stiffness / load / free**3), 1, 14):  # a limp one needs a good start
+        solved = solve_bvp(partial(slope, share), ends, s, shape, tol=1e-6, max_nodes=50000)
         if not solved.success:
             raise RuntimeError(solved.message)
         s, shape = solved.x, solved.y
