@@ -70,3 +70,13 @@ def test_robot_arm_carries_the_rope_without_stretching_it():
     assert 0 < float(largest) < 5
     lifted, = re.findall(r'It was lifted by (\d+) mm', heard)
     assert int(lifted) > 250
+
+
+@pytest.mark.long
+def test_an_arm_in_mujoco_carries_the_rope_without_stretching_it():
+    pytest.importorskip('mujoco', reason='needs MuJoCo: the extra "bench" of setup.py has it')
+    heard = example(dict(os.environ), 'mujoco_arm.py', '--pace', '4')
+    largest, = re.findall(r'The largest stretch was ([\d.]+) %', heard)
+    assert 0 < float(largest) < 5
+    lifted, moved = re.findall(r'It was lifted by (\d+) mm, and lies (\d+) mm away', heard)[0]
+    assert int(lifted) > 250 and int(moved) > 450
