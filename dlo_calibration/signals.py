@@ -27,12 +27,6 @@ def before_end(cleaner: Callable[[], None]) -> None:
     _cleaners.append(cleaner)
 
 
-def clean() -> None:
-    """Call what `before_end` registered."""
-    for one in _cleaners:
-        one()
-
-
 def end_at_signals(program: str) -> None:
     """
     From now on, let a signal end the process at once, with a line on stderr and `exit_code`.
@@ -40,7 +34,8 @@ def end_at_signals(program: str) -> None:
     Child processes that simulate end with this one.
     """
     def end(number: int, frame: FrameType | None) -> None:
-        clean()
+        for one in _cleaners:
+            one()
         try:
             os.write(2, f'{program}: interrupted\n'.encode())  # sys.stderr may be in use at this moment
         except OSError:

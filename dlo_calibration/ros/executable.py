@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 from typing import Callable, Sequence
 
-from dlo_calibration.signals import clean, StopFlag
+from dlo_calibration.signals import StopFlag
+from dlo_calibration.writing import remove_unfinished
 
 Spin = Callable[[Sequence[str], Callable[[], bool]], int]
 
@@ -41,4 +42,4 @@ def execute(program: str, purpose: str, load: Callable[[], Spin], args: Sequence
         return 2
     finally:
         stop.ignore()
-        clean()
+        remove_unfinished()

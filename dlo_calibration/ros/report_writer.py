@@ -1,10 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""ReportWriter: writes the page of a result in a thread of its own, because that takes seconds."""
+"""
+ReportWriter: writes the page of a result in the background, because that takes seconds.
+
+Its pictures are drawn in another process: while Matplotlib draws, no other thread of this one advances.
+"""
 
 from __future__ import annotations
 
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 import queue
 import threading
@@ -13,6 +19,8 @@ from typing import Iterator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
+from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.inference.slices import Slices
 from dlo_calibration.report.page import Origin, write_report
 from dlo_calibration.writing import reason
 
@@ -66,7 +74,13 @@ class ReportWriter:
                 thread.join()
             if older is not None and path.exists():
                 path.replace(older)
-            write_report(path, result, origin,
-                         lambda: sliced(result, origin.options, self._make_simulator, self._stop.is_set))
+            slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
+            with closing(ProcessExecutor(1)) as process:
+                process.submit(write_report, path, result, origin, partial(_known, slices)).result()
         except Exception as error:  # the user must learn why there is no page
             self._failures.put((path, reason(error)))
+
+
+def _known(slices: Slices | None) -> Slices | None:
+    """Return slices that were simulated before."""
+    return slices

@@ -12,6 +12,8 @@ from types import FunctionType, ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from dlo_calibration import export_usd, Options, read_result
+from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import write_result
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,7 +45,7 @@ def test_every_document_with_snippets_is_tried_here():
     documents = chain(ROOT.glob('*.md'), *(ROOT.glob(f'{folder}/**/*.md') for folder in (
         'benchmark', 'doc', 'examples', 'msg_samples')))
     found = {str(file.relative_to(ROOT)) for file in documents if snippets(file)}
-    assert found == {'README.md', 'doc/guide.md', 'doc/planning.md'}
+    assert found == {'README.md', 'doc/export.md', 'doc/guide.md', 'doc/planning.md'}
 
 
 def test_the_snippets_of_the_readme_work(tmp_path, capsys):
@@ -97,3 +99,16 @@ def test_the_snippet_about_planning_works(capsys, monkeypatch):
     assert capsys.readouterr().out.startswith('False')  # one action is not enough
     planned, = names['planned'].actions
     np.testing.assert_allclose(names['prediction'].steps[-1].chain, planned.predicted, atol=1e-3)
+
+
+def test_the_snippet_for_newton_works(tmp_path, monkeypatch):
+    newton = pytest.importorskip('newton', '1.8', reason='needs newton 1.8 and usd-core')
+    pytest.importorskip('pxr', reason='needs newton 1.8 and usd-core')
+    assert newton is not None
+    chain = read_chain_file(ROOT / 'msg_samples/chains/start.csv')
+    (tmp_path / 'dlo.usda').write_text(export_usd(read_result(DLO), chain, options=Options(nodes=21)))
+    monkeypatch.chdir(tmp_path)
+    snippet, = snippets('doc/export.md')
+    names = {}
+    performed(snippet, names, written={'range(2000)': 'range(2)'})
+    assert np.isfinite(names['now'].body_q.numpy()).all()
