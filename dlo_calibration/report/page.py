@@ -83,9 +83,29 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
     """
     Write the page as one file, which needs no other file and no network.
 
+    :param simulate_slices: see `page_of`.
+    :raises InputError: if the file cannot be written.
+    """
+    write_page(path, page_of(result, origin, simulate_slices))
+
+
+def write_page(path: Path, page: str) -> None:
+    """
+    Write a page.
+
+    :raises InputError: if the file cannot be written.
+    """
+    with whole(path) as new:
+        new.write_text(page, encoding='utf-8')
+
+
+def page_of(result: CalibrationResult, origin: Origin,
+            simulate_slices: Callable[[], Slices | None] = lambda: None) -> str:
+    """
+    Return the page, which needs no other file and no network.
+
     :param simulate_slices: returns slices through the found values, None: the page has none; called in a
         thread of its own, while this one draws the other pictures.
-    :raises InputError: if the file cannot be written.
     """
     with ThreadPoolExecutor(1) as thread:
         pending = thread.submit(simulate_slices)
@@ -94,7 +114,7 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
         slices = pending.result()
 
     values = plain(result)
-    page = _template().render(
+    return _template().render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
         verdict=verdict(result),
         rows=parameter_rows(values['parameters'], result.space),
@@ -109,8 +129,6 @@ def write_report(path: Path, result: CalibrationResult, origin: Origin,
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
         changed=_changed(origin.options), defaults=Options().flat(), options=origin.options.flat(),
         declarations=list(declarations()))
-    with whole(path) as new:
-        new.write_text(page, encoding='utf-8')
 
 
 @cache

@@ -21,7 +21,7 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.inference.slices import Slices
-from dlo_calibration.report.page import Origin, write_report
+from dlo_calibration.report.page import Origin, page_of, write_page
 from dlo_calibration.writing import reason
 
 PATIENCE = 10.0  # s; whoever ends the node does not wait longer
@@ -76,7 +76,8 @@ class ReportWriter:
                 path.replace(older)
             slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
             with closing(ProcessExecutor(1)) as process:
-                process.submit(write_report, path, result, origin, partial(_known, slices)).result()
+                page = process.submit(page_of, result, origin, partial(_known, slices)).result()
+            write_page(path, page)
         except Exception as error:  # the user must learn why there is no page
             self._failures.put((path, reason(error)))
 
