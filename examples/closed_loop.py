@@ -79,7 +79,8 @@ class SimulatedRobot:
             hands.append(Hand(name, (grip,), np.array(times), path))
         self.steps.append(Step(Action(tuple(hands))))
         # From the very start each time, as a chain alone does not tell how much the rope is stretched.
-        found = rehearse(self.simulator, Job(self.start, tuple(self.steps), self.physical, courses=True))
+        found, = rehearse(self.simulator, [
+            Job(self.start, tuple(self.steps), self.physical, courses=True)])
         course = (*found.courses[-1], found.chains[-1])
         for self.points in course:
             self.rest(times[-1] / self.pace / len(course))

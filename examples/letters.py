@@ -176,9 +176,9 @@ def laid(letter: str, executor: ProcessExecutor) -> Laid:
             left = error(reality.points, goal, dlo)
             sys.stdout.write(f'{letter}, action {k + 1}: {left:.2f} % of the length from the goal\n')
             sys.stdout.flush()
-        courses = rehearse(simulator, Job(Chain(start), reality.steps, dlo.physical, courses=True)).courses
+        laid, = rehearse(simulator, [Job(Chain(start), reality.steps, dlo.physical, courses=True)])
     return Laid(letter, dlo, goal, np.stack(chains), tuple(error(one, goal, dlo) for one in chains),
-                tuple(actions), courses)
+                tuple(actions), laid.courses)
 
 
 def error(points: Floats, goal: Floats, dlo: KnownDlo) -> float:

@@ -111,10 +111,12 @@ class ProcessExecutor(Executor):
         """End when all submitted calls are done."""
         if cancel_futures:
             self._cancel_waiting()
-        for _ in self._threads:
+        with self._beginning:  # else some of them may not have been started yet
+            threads = list(self._threads)
+        for _ in threads:
             self._tasks.put(None)
         if wait:
-            for thread in self._threads:
+            for thread in threads:
                 thread.join()
             atexit.unregister(self.close)
 

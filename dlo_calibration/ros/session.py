@@ -142,7 +142,9 @@ class CalibrationSession:
         return True, answer
 
     def tick(self) -> None:
-        """Do what is due now; the node calls this many times a second."""
+        """Do what is due now; the node calls this many times a second, and answers others in between."""
+        if not self.behind:
+            self._show(at_once=False)
         self._take_events()
         self._recorder.tell()
         for text in self._compiling.news():
@@ -151,8 +153,6 @@ class CalibrationSession:
         self._tell_dropped()
         self._start_by_itself()
         self._appraise()
-        if not self.behind:
-            self._show(at_once=False)
         self._report()
 
     def change_options(self) -> None:
@@ -351,7 +351,7 @@ class CalibrationSession:
         if older := self._recorder.result(event, options):
             self._graph.info(older)
         self._recorder.finish(interrupted=self._worker.stopped)
-        self._show()
+        situation.markers = Pace(wanted=True)  # at the next tick
         self._report()
 
     def _appraise(self) -> None:

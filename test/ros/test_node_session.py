@@ -455,6 +455,7 @@ def test_markers_show_trials_not_too_often_and_then_what_was_simulated(start):
     assert {f'trial_{k}/{name}' for k in (1, 2) for name in ('initial', 'goal', 'hands')} <= shown()
     assert not any(space.endswith('/simulated') for space in shown())
     graph.calibrated()
+    graph.session.tick()  # between the two, services are answered
     assert {'trial_1/simulated', 'trial_2/simulated'} <= shown()
     graph.send(session_messages(TYPES, 1, first=2))
     graph.ahead += 1.4
