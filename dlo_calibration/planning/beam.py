@@ -22,7 +22,6 @@ from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearsal, Step
 
 WIDTH = 3  # sequences that are continued
 KEPT = 4  # moves after each sequence that are refined
-CLIMBING = 2 * WIDTH  # sequences that the coarse simulation finds best, of which the default one chooses
 ALIKE = 0.2  # of the cost; of sequences that end nearer to each other, the better one is continued
 PRICE = 1.08  # factor on the cost that an action must save
 NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
@@ -167,7 +166,7 @@ class BeamSearch:
         actions = self._options.actions
         moves = len(carrying(self._start.points, self._objective.goal, self._options.kinds,
                              self._options.hands))
-        following = moves + KEPT * (2 * self._options.hands + len(SHARES)) + WIDTH
+        following = moves + KEPT * (2 * self._options.hands + len(SHARES))
         displacements = 2 * actions * self._options.hands
         return int(following * (1 + WIDTH * (actions - 1))
                    + actions * (displacements + TOGETHER * len(SHARES) + 1 + len(self._draws)))
@@ -250,7 +249,7 @@ class BeamSearch:
                 permitted = [draft for move in choices
                              if self._permits(draft := Draft(course, (move,), course.chains[-1:]))]
                 drafts += permitted[:1]
-        seen = yield from self._tried(drafts, coarse=True)
+        seen = yield from self._tried(drafts)
         first: list[tuple[Course, Course, Draft]] = []
         for draft, one in zip(drafts, seen, strict=True):
             if one is not None:
@@ -259,14 +258,8 @@ class BeamSearch:
         for course in beam:
             own = sorted((entry for entry in first if entry[0] is course), key=lambda entry: entry[1].cost)
             chosen += own[:KEPT]
-        refined = yield from self._refined([entry[2] for entry in chosen], [entry[1] for entry in chosen], 1,
-                                           coarse=True)
-        bases = {course: entry[0] for course, entry in zip(refined, chosen, strict=True)}
-        best = self._distinct(sorted(refined, key=lambda course: course.cost))[:CLIMBING]
-        climbed = yield from self._tried([
-            Draft(bases[one], one.moves[-1:], bases[one].chains[-1:]) for one in best])
-        return self._distinct(sorted((one for one in climbed if one is not None),
-                                     key=lambda course: course.cost))[:WIDTH]
+        refined = yield from self._refined([entry[2] for entry in chosen], [entry[1] for entry in chosen], 1)
+        return self._distinct(sorted(refined, key=lambda course: course.cost))[:WIDTH]
 
     def _distinct(self, courses: Sequence[Course]) -> list[Course]:
         """Return courses, best first, without those that end almost like a better one."""
@@ -282,8 +275,8 @@ class BeamSearch:
         drafts = [Draft(self._root, course.moves, course.chains[:-1]) for course in courses]
         return (yield from self._refined(drafts, courses, TOGETHER))
 
-    def _refined(self, drafts: Sequence[Draft], seen: Sequence[Course], iterations: int,
-                 coarse: bool = False) -> Asking[list[Course]]:
+    def _refined(self, drafts: Sequence[Draft], seen: Sequence[Course], iterations: int
+                 ) -> Asking[list[Course]]:
         """Refine the displacements of drafts, which were seen to become courses, side by side."""
         under_way: dict[int, tuple[Refinement[Course], list[Floats]]] = {}
         best = list(seen)
@@ -294,7 +287,7 @@ class BeamSearch:
         while under_way:
             asked = [(k, drafts[k].shifted(point))
                      for k, (_, points) in under_way.items() for point in points]
-            told = yield from self._tried([draft for _, draft in asked], coarse)
+            told = yield from self._tried([draft for _, draft in asked])
             for k, (refinement, _) in list(under_way.items()):
                 own = [one for (index, _), one in zip(asked, told, strict=True) if index == k]
                 best[k] = min([best[k], *(one for one in own if one is not None)], key=lambda one: one.cost)
@@ -304,19 +297,13 @@ class BeamSearch:
                     del under_way[k]
         return best
 
-    def _tried(self, drafts: Sequence[Draft], coarse: bool = False) -> Asking[list[Course | None]]:
-        """
-        Return the courses that drafts become; None where one is not permitted or cannot be simulated.
-
-        :param coarse: whether a coarse simulation tells.
-        """
+    def _tried(self, drafts: Sequence[Draft]) -> Asking[list[Course | None]]:
+        """Return the courses that drafts become; None where one is not permitted or cannot be simulated."""
         permitted = [draft for draft in drafts if self._permits(draft)]
         jobs = [Job(self._chain(draft.base), self._steps(draft.moves, draft.before), self._physical,
-                    self._watched, coarse) for draft in permitted]
+                    self._watched) for draft in permitted]
         told = (yield jobs) if jobs else []
         found = {id(draft): self._course(draft, one) for draft, one in zip(permitted, told, strict=True)}
-        self.best = min([self.best, *(one for one in found.values() if one is not None and not coarse)],
-                        key=lambda course: course.cost)
         return [found.get(id(draft)) for draft in drafts]
 
     def _chain(self, course: Course) -> Chain:
@@ -342,8 +329,11 @@ class BeamSearch:
         """Return the course that a draft becomes; None if it failed or is not permitted."""
         if seen.failure or not self._allowed(self._forbidden(seen)):
             return None
-        return Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
-                      self._objective.cost(seen.chains[-1]))
+        found = Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
+                       self._objective.cost(seen.chains[-1]))
+        if found.cost < self.best.cost:
+            self.best = found
+        return found
 
     def _forbidden(self, seen: Rehearsal) -> str:
         """Return why the DLO must not move like this; empty if it may."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
-from contextlib import closing, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass
 import time
 from typing import Callable, Iterator, Mapping
@@ -28,7 +28,6 @@ from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.prediction import intervals
 from dlo_calibration.planning.rehearsal import Rehearser
-from dlo_calibration.planning.rungs import coarser
 
 
 @dataclass(frozen=True)
@@ -83,14 +82,13 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
         on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end), left))
 
     with ExitStack() as stack:
-        simulator, coarse = (stack.enter_context(closing(make_simulator(one)))
-                             for one in (simulation, coarser(simulation)))
+        simulator = make_simulator(simulation)
+        stack.callback(simulator.close)
         own = executor is None and options.workers != 1
         if own:
             executor = started = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
             stack.callback(started.close)
-        rehearse, last = Rehearser(simulator, executor, should_stop, own, coarse), Rehearser(
-            simulator, executor)
+        rehearse, last = Rehearser(simulator, executor, should_stop, own), Rehearser(simulator, executor)
         _finish(search, rehearse, last, tell)
         said = () if search.reached else (*remarks(last, posterior, start, goal, options),
                                           *_remarks_on_refusals(search.refusals))

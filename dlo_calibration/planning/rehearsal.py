@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
+import copy
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 import math
@@ -71,14 +72,12 @@ class Job:
 
     :param physical: parameters by name (SI units).
     :param courses: whether the course of each action is wanted, too.
-    :param coarse: whether it is simulated with fewer nodes and longer steps.
     """
 
     start: Chain
     steps: tuple[Step, ...]
     physical: Mapping[str, float]
     courses: bool = False
-    coarse: bool = False
 
     def same_actions(self, other: Job) -> bool:
         """Tell whether another job only has other parameters."""
@@ -149,7 +148,6 @@ class Rehearser:
     Rehearses many jobs, in this thread or by an executor; the results do not depend on that.
 
     :param simulator: belongs to this thread; workers use copies of it.
-    :param coarse: the same for coarse jobs, which are asked for by themselves; None: the simulator itself.
     :param executor: None: this thread simulates.
     :param should_stop: asked often.
     :param takes_part: this thread simulates, too, what the executor has not begun yet: its processes may
@@ -157,15 +155,14 @@ class Rehearser:
     """
 
     def __init__(self, simulator: Simulator, executor: Executor | None = None,
-                 should_stop: Callable[[], bool] = lambda: False, takes_part: bool = False,
-                 coarse: Simulator | None = None) -> None:
+                 should_stop: Callable[[], bool] = lambda: False, takes_part: bool = False) -> None:
         self.count = 0  # simulated actions so far
-        self._simulators = simulator, simulator if coarse is None else coarse
+        self._simulator = simulator
         self._executor = executor
         self._should_stop = should_stop
         self._takes_part = takes_part
         self._key = uuid.uuid4().hex  # identifies this simulator in the workers
-        self._packed = b'' if executor is None else pickle.dumps(self._simulators, pickle.HIGHEST_PROTOCOL)
+        self._packed = b'' if executor is None else pickle.dumps(simulator, pickle.HIGHEST_PROTOCOL)
 
     def __call__(self, jobs: Sequence[Job]) -> list[Rehearsal]:
         """
@@ -179,7 +176,7 @@ class Rehearser:
         return found
 
     def _rehearsed_here(self, jobs: Sequence[Job]) -> list[Rehearsal]:
-        return rehearse(self._simulators[jobs[0].coarse], jobs, self._check) if jobs else []
+        return rehearse(self._simulator, jobs, self._check)
 
     def _rehearsed_by(self, executor: Executor, jobs: Sequence[Job]) -> list[Rehearsal]:
         size = self._portion(executor, len(jobs))
@@ -198,7 +195,7 @@ class Rehearser:
 
     def _portion(self, executor: Executor, jobs: int) -> int:
         """Return how many of so many jobs are simulated at a time."""
-        if not isinstance(self._simulators[0], TogetherSimulator):
+        if not isinstance(self._simulator, TogetherSimulator):
             return 1
         return min(AT_A_TIME, math.ceil(jobs / getattr(executor, 'workers', 1)))
 
@@ -217,23 +214,22 @@ class Rehearser:
 
 
 class _WorkerThread(threading.local):
-    """The simulators that a worker's thread keeps."""
+    """The simulator that a worker's thread keeps."""
 
     key = ''
-    simulators: tuple[Simulator, Simulator]
+    simulator: Simulator
 
 
 _worker_thread = _WorkerThread()
 
 
 def _rehearse_in_worker(key: str, packed: bytes, jobs: Sequence[Job]) -> list[Rehearsal]:
-    """Rehearse jobs in a worker, which keeps the simulators of a plan."""
+    """Rehearse jobs in a worker, which keeps the simulator of a plan."""
     if _worker_thread.key != key:
         if _worker_thread.key:
-            for simulator in _worker_thread.simulators:
-                simulator.close()
-        _worker_thread.simulators = pickle.loads(packed)  # noqa: S301  # sent by the parent process
+            _worker_thread.simulator.close()
+        _worker_thread.simulator = copy.copy(pickle.loads(packed))  # noqa: S301  # sent by the parent process
         _worker_thread.key = key
-    return rehearse(_worker_thread.simulators[jobs[0].coarse], jobs)
+    return rehearse(_worker_thread.simulator, jobs)
 
 
