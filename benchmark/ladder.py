@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Measure the rungs: what fewer nodes and longer steps cost and save, in searches and in plans.
+Measure the rungs: what fewer nodes and longer steps cost and save in searches.
 
     python benchmark/ladder.py [SESSION ...]
 
 Searches are those of the sessions, by default of the five samples.  Each is made with the default nodes and
 steps, and on each rung.  The result of a rung then climbs: least squares goes on with the default ones from
 there, with the Jacobian that it has; of the points of another search, the tenth with the lowest scores is
-evaluated again.  Plans are those of the planner with the true parameters, for random pairs of a start and a
-goal of each sample; they are only made for the samples.  All is simulated in one process.  The tables are
-printed, and those of the samples written to benchmark/results/ladder.md.
+evaluated again.  All is simulated in one process.  The table is printed, and that of the samples written to
+benchmark/results/ladder.md.
 """
 
 from __future__ import annotations
@@ -24,28 +23,23 @@ from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
 
-from dlo_calibration import Chain, Options, plan, PlanOptions
+from dlo_calibration import Options
 from dlo_calibration.calibration.calibrate import fitted
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.prior import prior
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.experiment.knowledge import Knowledge, TRUE
-from dlo_calibration.experiment.known_dlos import KNOWN_DLOS
-from dlo_calibration.experiment.pairs import Pair, random_pair, seen
 from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares, SEARCHES
 from dlo_calibration.simulation import together  # noqa: F401  # loaded before the first measurement
-from dlo_calibration.simulation.compiled import CompiledSimulator
 
 RESULTS = Path(__file__).resolve().parent / 'results'
 RUNGS = ((31, 0.004), (21, 0.006), (15, 0.009))  # nodes, time step [s]
 BUDGET = 150  # evaluations
 KNOWN = 0.5  # of the range; parameters with wider intervals are left out
-PAIRS = 4  # for each sample
 
 
 class Measured(NamedTuple):
@@ -115,40 +109,6 @@ class Comparison:
         return replace(found, best=min(again, key=lambda one: one.score), evaluations=tuple(again))
 
 
-class Counting(CompiledSimulator):
-    """It counts its rollouts."""
-
-    count = 0
-
-    def simulate_together(self, jobs, between=lambda: None):  # type: ignore[no-untyped-def]
-        """Count and simulate."""
-        self.count += len(jobs)
-        return super().simulate_together(jobs, between)
-
-
-def planned(pairs: Sequence[tuple[Knowledge, Pair, Options]], rung: tuple[int, float] | None) -> list[float]:
-    """
-    Return means over plans: rollouts by default and on the rung, seconds, actions, error [%], share reached.
-
-    :param rung: nodes and time step [s]; None: the default ones for all.
-    """
-    rows = []
-    for knowledge, pair, simulation in pairs:
-        made: list[Counting] = []
-
-        def make(options: Options, simulation: Options = simulation, made: list[Counting] = made) -> Counting:
-            nodes, step = (simulation.nodes, simulation.time_step) if rung is None or not made else rung
-            made.append(Counting(nodes=nodes, time_step=step))
-            return made[-1]
-
-        begun = time.process_time()
-        found = plan(knowledge, Chain(seen(pair.start.points)), Chain(seen(pair.goal.points)),
-                     PlanOptions(workers=1), simulation=simulation, make_simulator=make)
-        rows.append([made[0].count, made[1].count, time.process_time() - begun, len(found.actions),
-                     100 * found.error_after / knowledge.length, found.reached])
-    return [float(mean) for mean in np.mean(rows, axis=0)]
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     return '\n'.join(f'| {" | ".join(row)} |' for row in (head, ['---'] * len(head), *rows))
@@ -178,26 +138,8 @@ def searches(sessions: Sequence[Path]) -> str:
                   'error after climbing'), rows)
 
 
-def plans() -> str:
-    """Return the table of the plans."""
-    pairs = []
-    for dlo in KNOWN_DLOS:
-        simulation = Options.of({'mass': dlo.mass, 'workers': 1})
-        finer = make_simulator(simulation).refined()
-        assert finer is not None
-        pairs += [(Knowledge.without_doubt(TRUE, dlo), random_pair(dlo, k, 1, finer), simulation)
-                  for k in range(PAIRS)]
-    rows = []
-    for rung in (None, *RUNGS):
-        default, coarse, seconds, actions, error, reached = planned(pairs, rung)
-        rows.append([name_of(rung), f'{default:.0f}', f'{coarse:.0f}', f'{seconds:.2f}', f'{actions:.2f}',
-                     f'{error:.3f}', f'{reached:.0%}'])
-    return table(('rung', 'rollouts, default', 'rollouts on the rung', 's', 'actions', 'error, %', 'reached'),
-                 rows)
-
-
 def main() -> None:
-    """Make the tables."""
+    """Make the table."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('sessions', nargs='*', metavar='SESSION', type=Path)
@@ -205,25 +147,14 @@ def main() -> None:
     if chosen.sessions:
         print(searches(chosen.sessions))
         return
-    planned_table = plans()
-    print(planned_table)
     text = f"""# ladder
 
 `python benchmark/ladder.py`
 
-## Plans for {PAIRS} random pairs of a start and a goal of each sample
-
-Candidates are compared on the rung, and the default nodes and steps decide between the best; without a rung,
-all have these. Means; the error is that which the plan expects, in % of the length. Seconds are those of one
-process.
-
-{planned_table}
-
-## Searches on the five samples
-
-Error: the largest distance of a found value from that with the default nodes and steps, in units of its 90 %
-interval; parameters with intervals above half of the range are left out. Mean over the samples (largest). In
-the row `default` it is that of another seed. Seconds are those of one process, for all samples.
+Searches on the five samples. Error: the largest distance of a found value from that with the default nodes
+and steps, in units of its 90 % interval; parameters with intervals above half of the range are left out. Mean
+over the samples (largest). In the row `default` it is that of another seed. Seconds are those of one process,
+for all samples.
 
 {searches([samples() / f'object{k}' for k in range(1, 6)])}
 """

@@ -28,7 +28,7 @@ ONLY = {
     'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
     'pybullet': ('simulation/bullet_world.py', 'simulation/window.py'),
     'cv2': ('capture',),
-    'PIL': ('capture',),
+    'PIL': ('capture', 'report/animation.py'),
     'numba': ('simulation/lanes.py', 'simulation/kernels.py', 'simulation/kernels_together.py',
               'capture/path.py'),
     'cma': ('search/cma_es.py',),

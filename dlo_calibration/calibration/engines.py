@@ -21,23 +21,25 @@ SimulatorFactory = Callable[[Options], Simulator]
 
 def _bullet(options: Options) -> Simulator:
     if not options.scene:
-        return Unmade('bullet', 'dlo_calibration.simulation.bullet', 'BulletSimulator',
-                      engine_settings(options))
-    from dlo_calibration.simulation.bullet import BulletSimulator
-
-    simulator = BulletSimulator(**engine_settings(options), scene=options.scene)
+        return Unmade('bullet', _bullet_itself, options)
+    simulator = _bullet_itself(options)
     if parent_process() is not None:  # a worker's process is one of its own already
         return simulator
     # A scene may come from a stranger: what it does to PyBullet must not end the node or the command.
     return SimulatorApart(simulator, f'scene {options.scene}', options.answer_limit)
 
 
+def _bullet_itself(options: Options) -> Simulator:
+    from dlo_calibration.simulation.bullet import BulletSimulator
+
+    return BulletSimulator(**engine_settings(options), scene=options.scene)
+
+
 def _compiled(options: Options) -> Simulator:
     if options.scene:
         raise InputError('engine compiled', f'scene {options.scene}', 'no scene: it simulates only a table',
                          'use engine bullet or auto')
-    return UnmadeTogether('compiled', 'dlo_calibration.simulation.compiled', 'CompiledSimulator',
-                          engine_settings(options))
+    return UnmadeTogether('compiled', _compiled_itself, options)
 
 
 def _auto(options: Options) -> Simulator:
@@ -47,6 +49,12 @@ def _auto(options: Options) -> Simulator:
                    f'not support a scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)
+
+
+def _compiled_itself(options: Options) -> Simulator:
+    from dlo_calibration.simulation.compiled import CompiledSimulator
+
+    return CompiledSimulator(**engine_settings(options))
 
 
 def engine_settings(options: Options) -> dict[str, Any]:

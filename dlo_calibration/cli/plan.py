@@ -62,11 +62,11 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         if stop() and not made.actions and not made.reached:
             raise KeyboardInterrupt(stop.exit_code)
         try:
+            _print(made, plan_sentences(made), chosen.json)  # first, as drawings take seconds
+        finally:  # whatever becomes of the output
             if chosen.output is not None:
                 write_plan_files(chosen.output, made, found, simulation, make_simulator)
                 tell(f'the plan is in {chosen.output}')
-        finally:  # whatever the disk does
-            _print(made, plan_sentences(made), chosen.json)
     return 0
 
 

@@ -44,11 +44,12 @@ def write_plan_files(folder: Path, plan: Plan, found: Description, simulation: O
     for k, one in enumerate(plan.actions, start=1):
         with attempts.attempt(f'after_{k}.csv'):
             write_chain(folder / f'after_{k}.csv', Chain(one.predicted))
-    with attempts.attempt(f'{PLAN}.png'):
-        write_plan_picture(plan, path.with_suffix('.png'))
     if plan.actions:
         with attempts.attempt(f'{PLAN}.xml'):
             write_request(path.with_suffix('.xml'), plan_request(plan, found, simulation))
+    with attempts.attempt(f'{PLAN}.png'):
+        write_plan_picture(plan, path.with_suffix('.png'))
+    if plan.actions:
         with attempts.attempt(f'{PLAN}.gif'), closing(make_simulator(simulation)) as simulator:
             write_plan_animation(plan, simulator, Posterior.of(found).best, path.with_suffix('.gif'))
     attempts.require()

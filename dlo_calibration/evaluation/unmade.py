@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any, Callable, cast, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.kernel_cache import is_compiled, SIMULATION
-from dlo_calibration.simulation.protocol import Job, Rollout, Simulator, TogetherSimulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
 
 
 class Unmade:
@@ -19,22 +18,21 @@ class Unmade:
     A simulator that is made when it first simulates; pickled or copied, it becomes the simulator itself.
 
     :param name: of the engine.
-    :param module: full name of the module of its class.
-    :param kind: name of its class.
-    :param settings: arguments of its constructor.
+    :param make: a function of a module, which makes the simulator.
+    :param arguments: of this function.
     :param finer: whether to refine it once it is made.
     """
 
-    def __init__(self, name: str, module: str, kind: str, settings: Mapping[str, Any],
+    def __init__(self, name: str, make: Callable[..., Simulator], *arguments: Any,
                  finer: bool = False) -> None:
         self.name = name
-        self._parts = module, kind, dict(settings)
+        self._parts = make, *arguments
         self._finer = finer
         self._made: Simulator | None = None
 
     @property
     def _itself(self) -> Simulator:
-        self._made = self._made or _new(*self._parts, self._finer)
+        self._made = self._made or _new(self._finer, *self._parts)
         return self._made
 
     def prepare(self) -> None:
@@ -55,20 +53,20 @@ class Unmade:
         if self._made is not None:
             self._made.close()
 
-    def __reduce__(self) -> tuple[Callable[..., Simulator], tuple[str, str, dict[str, Any], bool]]:
-        return _new, (*self._parts, self._finer)
+    def __reduce__(self) -> tuple[Callable[..., Simulator], tuple[Any, ...]]:
+        return _new, (self._finer, *self._parts)
 
 
 class UnmadeTogether(Unmade):
-    """One to which several rollouts at a time are less work."""
+    """One that is given several rollouts at a time."""
 
     def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None] = lambda: None
                           ) -> list[Rollout | SimulationError]:
         """Simulate each job; see `TogetherSimulator`."""
-        return cast(TogetherSimulator, self._itself).simulate_together(jobs, between)
+        return list(simulate_all(self._itself, jobs, between))
 
 
-def _new(module: str, kind: str, settings: Mapping[str, Any], finer: bool) -> Simulator:
-    made: Simulator = getattr(import_module(module), kind)(**settings)
+def _new(finer: bool, make: Callable[..., Simulator], *arguments: Any) -> Simulator:
+    made = make(*arguments)
     refined = made.refined() if finer else None
     return refined or made

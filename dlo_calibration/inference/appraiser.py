@@ -42,9 +42,9 @@ from dlo_calibration.simulation.protocol import Simulator
 
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
-STARTS = 4  # simulations of each trial from initial chains with other noise
-WORTH_A_MOVE = 0.1  # the same of a value that no derivative points to
+WORTH_A_MOVE = 0.1  # share of the cost that a value must save to which no derivative points
 LOOKED_AT = (0.15, 0.4, 0.65, 0.9)  # values of a parameter of which nothing is known
+STARTS = 4  # simulations of each trial from initial chains with other noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,14 +206,14 @@ class Appraiser:
         of a DLO that is much more elastic than a rope.
         """
         shown = np.logical_or.reduce(excites(trials, self.space, self.table_height))
-        found = best.point
+        found, cost = best.point, best.loss.cost(best.residuals)
         for k, name in enumerate(self.space.free):
             if name not in self.guessed or not shown[k] or best.found.verdicts[k] != NOT_IDENTIFIABLE:
                 continue
-            points = [found, *(np.where(np.arange(len(found)) == k, value, found) for value in LOOKED_AT)]
+            points = [np.where(np.arange(len(found)) == k, value, found) for value in LOOKED_AT]
             costs = [best.loss.cost(self._residuals(trials, one)) for one in points]
-            if min(costs) < (1 - WORTH_A_MOVE) * costs[0]:
-                found = points[int(np.argmin(costs))]
+            if min(costs) < (1 - WORTH_A_MOVE) * cost:
+                found, cost = points[int(np.argmin(costs))], min(costs)
         return None if found is best.point else found
 
     def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,

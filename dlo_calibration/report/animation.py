@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Iterator, Mapping, Sequence
+from typing import Any, Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+from PIL.Image import Dither, fromarray, Image
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.quantity import number
@@ -21,6 +22,7 @@ from dlo_calibration.simulation.protocol import Simulator
 from dlo_calibration.writing import Attempts, whole
 
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
+PAUSE = 1600  # ms, to look at the end
 
 
 @dataclass(frozen=True)
@@ -46,20 +48,19 @@ def write_animation(trial: Trial, motion: Motion, path: str | Path,
     :param captions: None: the chains of the trial were measured.
     :raises InputError: if the file cannot be written.
     """
-    from matplotlib.animation import PillowWriter
-
     speed = max(1.0, (motion.times[-1] - motion.times[0]) * FRAME_RATE / max(len(motion.times) - 1, 1))
     captions = captions or Captions(f'{trial.name}, simulated')
-    writer = PillowWriter(fps=FRAME_RATE, metadata={'comment': captions.title})
-    with whole(Path(path)) as new, settings():
-        scene: Any = _Scene(trial, motion, speed, captions)
-        with writer.saving(scene, str(new), dpi=DOTS_PER_INCH):
-            for time, chain in zip(motion.times, motion.chains, strict=True):
-                scene.show(float(time), chain, f't = {time:.2f} s')  # of constant width
-                writer.grab_frame()
-            scene.show(float(motion.times[-1]), motion.ends[-1], 'at the end')
-            for _ in range(round(1.6 * FRAME_RATE)):  # a pause, to look at the end
-                writer.grab_frame()
+    with settings():
+        scene = _Scene(trial, motion, speed, captions)
+        frames = [scene.frame(float(time), chain, f't = {time:.2f} s')  # of constant width
+                  for time, chain in zip(motion.times, motion.chains, strict=True)]
+        frames.append(scene.frame(float(motion.times[-1]), motion.ends[-1], 'at the end'))
+    # All frames have the same colours. To look for those of each frame takes twenty times as long.
+    colours = frames[0].quantize(dither=Dither.NONE)
+    first, *others = (one.quantize(palette=colours, dither=Dither.NONE) for one in frames)
+    with whole(Path(path)) as new:
+        first.save(new, 'GIF', save_all=True, append_images=others, loop=0,
+                   duration=[*[1000 // FRAME_RATE] * len(others), PAUSE])
 
 
 def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Mapping[str, float],
@@ -87,7 +88,7 @@ class _Scene:
     """
     A figure in which only the simulated chain and the hands move.
 
-    To a writer, it is a figure.  What does not move is drawn once, as that takes most of the time.
+    What does not move is drawn once, as that takes most of the time.
     """
 
     def __init__(self, trial: Trial, motion: Motion, speed: float, captions: Captions) -> None:
@@ -113,16 +114,13 @@ class _Scene:
         self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
 
-    def get_size_inches(self) -> Floats:
-        """Return width and height [in]."""
-        return np.asarray(self._figure.get_size_inches())
-
-    def savefig(self, target: BinaryIO, **_: Any) -> None:
-        """Write the pixels of what is shown."""
+    def frame(self, time: float, chain: Floats, when: str) -> Image:
+        """Return a picture of the chain and the hands at a time of the trial [s]; `when` is in the title."""
+        self._show(time, chain, when)
         self._canvas.restore_region(self._still)
         for artist in self._artists():
             self._figure.draw_artist(artist)
-        target.write(bytes(self._canvas.buffer_rgba()))
+        return fromarray(np.asarray(self._canvas.buffer_rgba())[:, :, :3])
 
     def _artists(self) -> Iterator[Any]:
         """Yield what moves, in the order in which it is drawn."""
@@ -150,8 +148,7 @@ class _Scene:
         view.axes.autoscale_view()
         return view, measured, line, hands
 
-    def show(self, time: float, chain: Floats, when: str) -> None:
-        """Show the chain and the hands at a time of the trial [s]; `when` goes into the title."""
+    def _show(self, time: float, chain: Floats, when: str) -> None:
         self._title.set_text(as_text(f'{self._captions.title}: {when}{self._speed}'))
         current = hands_at(self._trial, time)
         seen = [goal.chain for goal in self._trial.goals if goal.time <= time] or [self._trial.initial]

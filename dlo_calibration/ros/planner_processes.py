@@ -12,14 +12,12 @@ from __future__ import annotations
 from concurrent.futures import CancelledError, wait
 from contextlib import closing
 import threading
-from typing import Any, Callable, Mapping, Sequence
+from typing import Callable
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import DloCalibrationError, SimulationError
+from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.processes import cores, ProcessExecutor
-from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
 
 PERIOD = 0.05  # s between two looks whether to wait no longer
 
@@ -109,50 +107,6 @@ class PlannerProcesses:
 def _check(should_stop: Callable[[], bool]) -> None:
     if should_stop():
         raise DloCalibrationError('it was stopped while the engine was being loaded or compiled')
-
-
-class MadeWhereUsed:
-    """
-    A simulator whose engine is made by the first process that simulates with a copy of it.
-
-    :param make_simulator: makes the engine with the options.
-    """
-
-    name = 'made where it is used'
-
-    def __init__(self, make_simulator: SimulatorFactory, options: Options) -> None:
-        self._make_simulator, self._options = make_simulator, options
-        self._simulator: Simulator | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, '_simulator': None}
-
-    def prepare(self) -> None:
-        """Do nothing: the processes prepare themselves."""
-
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        """Simulate a trial with the engine."""
-        return self._made().simulate(trial, physical)
-
-    def simulate_together(self, jobs: Sequence[Job],
-                          between: Callable[[], None]) -> list[Rollout | SimulationError]:
-        """Simulate each job with the engine; see `TogetherSimulator`."""
-        return list(simulate_all(self._made(), jobs, between))
-
-    def refined(self) -> Simulator | None:
-        """Return the finer engine."""
-        return self._made().refined()
-
-    def close(self) -> None:
-        """Close the engine."""
-        if self._simulator is not None:
-            self._simulator.close()
-            self._simulator = None
-
-    def _made(self) -> Simulator:
-        if self._simulator is None:
-            self._simulator = self._make_simulator(self._options)
-        return self._simulator
 
 
 def _load(make_simulator: SimulatorFactory, simulation: Options) -> None:

@@ -20,6 +20,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.compiling import Compiling
+from dlo_calibration.evaluation.unmade import UnmadeTogether
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
@@ -43,7 +44,7 @@ from dlo_calibration.ros.planner_diagnostics import (
 )
 from dlo_calibration.ros.planner_markers import plan_markers
 from dlo_calibration.ros.planner_options import PlannerOptions
-from dlo_calibration.ros.planner_processes import MadeWhereUsed, PlannerProcesses
+from dlo_calibration.ros.planner_processes import PlannerProcesses
 
 CHAIN, GOAL, DESCRIPTION = 'chain', 'goal_chain', 'dlo_description'
 ACTION, STEPS = 'action', 'steps'
@@ -109,7 +110,7 @@ class PlannerSession:
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
         self._find = plan
-        self._make_simulator = functools.partial(MadeWhereUsed, make_simulator)
+        self._make_simulator = functools.partial(UnmadeTogether, 'of a process', make_simulator)
         self._background: Background[Event] = Background('plan')
         self._compiling = Compiling()
         self._processes: Processes = processes or PlannerProcesses(

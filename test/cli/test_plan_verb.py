@@ -145,6 +145,18 @@ def test_a_file_that_cannot_be_written_prevents_no_other_and_no_output(run, chai
     assert (tmp_path / 'out' / 'plan.gif').is_file()
 
 
+def test_who_does_not_wait_for_the_drawings_has_the_plan(run, chains, planned, tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt(130)
+
+    planned()
+    monkeypatch.setattr('dlo_calibration.report.plan_drawing.write_plan_picture', stopped)
+    code, output, _ = run('plan', ROPE, *chains, '--output', tmp_path / 'out', '--json')
+    assert code == 130
+    assert len(json.loads(output)['actions']) == 2
+    assert {'plan.json', 'plan.xml', 'after_2.csv'} <= {file.name for file in (tmp_path / 'out').iterdir()}
+
+
 @pytest.mark.parametrize('actions, code', [(2, 0), (0, 130)])
 def test_a_plan_that_is_stopped_is_the_best_so_far(run, chains, planned, actions, code):
     asked = planned(lambda: os.kill(os.getpid(), signal.SIGINT), actions=actions)

@@ -247,7 +247,7 @@ def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
         durations.append(gif.info['duration'])
     assert len(frames) > 6
     assert all((one != two).any() for one, two in zip(frames[:-1], frames[1:], strict=True))
-    assert durations[-1] > 5 * durations[0]
+    assert durations[-1] > 4 * durations[0]
     assert sum(durations) / 1e3 > trial.hands[0].end
 
 

@@ -16,8 +16,9 @@ from toy_simulator import new_toy, toy_trial, ToySimulator
 
 from dlo_calibration import DloCalibrationError, InputError
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.evaluation.unmade import Unmade
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.ros.planner_processes import MadeWhereUsed, PlannerProcesses
+from dlo_calibration.ros.planner_processes import PlannerProcesses
 
 PATIENCE = 60.0  # s
 TRIAL = toy_trial({'flexibility': 40.0, 'elasticity': 30.0, 'friction': 70.0, 'self_collision': 20.0})
@@ -43,7 +44,7 @@ def kept():
 
 
 def simulated_there(executor, factory=new_toy):
-    simulator = MadeWhereUsed(factory, Options())
+    simulator = Unmade('toy', factory, Options())
     return executor.submit(simulator.simulate, TRIAL, PHYSICAL).result(PATIENCE).chains
 
 
@@ -105,16 +106,3 @@ def test_nothing_starts_after_closing(kept):
     with pytest.raises(CancelledError):
         processes.ready(Options(), 1)
     assert not simulating(os.getpid())
-
-
-def test_a_simulator_is_made_by_the_process_that_uses_it():
-    made = []
-    simulator = MadeWhereUsed(lambda options: made.append(options) or ToySimulator(), Options())
-    simulator.prepare()
-    assert made == []
-    simulator.simulate(TRIAL, PHYSICAL)
-    simulator.simulate(TRIAL, PHYSICAL)
-    assert made == [Options()]
-    simulator.close()
-    simulator.simulate(TRIAL, PHYSICAL)
-    assert len(made) == 2
