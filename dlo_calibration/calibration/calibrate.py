@@ -81,7 +81,6 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
             simulator.prepare()
         memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
-        stack.callback(setting.close)
         result = fitted(setting)
         ahead = confirming(result, options, make_simulator, None if options.scheduler else executor)
         result = advised(setting, result)

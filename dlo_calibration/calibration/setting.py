@@ -13,10 +13,10 @@ from typing import Callable
 from dlo_calibration.calibration.automatic import choose, chooses_parts
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.apart import SimulatorApart
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.executed import Executed
 from dlo_calibration.evaluation.memory import Memory
 from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.model.parameters import ParameterSpace
@@ -58,7 +58,7 @@ class Setting:
 
     @property
     def own_simulator(self) -> Simulator:
-        """The engine for stages that simulate one trial after the other; it remembers each rollout."""
+        """The engine for stages that simulate other trials; it remembers each rollout."""
         return self.memory.simulator(self._alone)
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
@@ -74,17 +74,10 @@ class Setting:
         return BatchEvaluator(evaluator, self.should_stop, self.executor,
                               self.memory.of(evaluator, finer is not None))
 
-    @cached_property
+    @property
     def _alone(self) -> Simulator:
-        """The engine, in a process of its own if others simulate evaluations: this one loads no kernels."""
-        if self.executor is None:
-            return self.simulator
-        return SimulatorApart(self.simulator, 'trials', self.options.answer_limit)
-
-    def close(self) -> None:
-        """End the process that it may have started."""
-        if self.executor is not None and '_alone' in vars(self):
-            self._alone.close()
+        """The engine; if others simulate evaluations, they simulate for it: this process loads no kernels."""
+        return self.simulator if self.executor is None else Executed(self.simulator, self.executor)
 
     @cached_property
     def _usual(self) -> BatchEvaluator:

@@ -37,9 +37,12 @@ def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
     """Return a result with the action to observe next, if its covariance is valid."""
     if result.examination is None or not result.examination.regular:
         return result
-    return replace(result, advice=advise(
-        result.trials, result.space, setting.own_simulator, result.best.point, result.examination.uncertainty,
-        result.length, setting.should_stop))
+    try:
+        return replace(result, advice=advise(
+            result.trials, result.space, setting.own_simulator, result.best.point,
+            result.examination.uncertainty, result.length, setting.should_stop))
+    except CancelledError:
+        return result
 
 
 def with_missing_parameters(setting: Setting, result: CalibrationResult) -> CalibrationResult:
@@ -54,9 +57,9 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
     rows = compared_rows(result.trials)
     try:
         return replace(result, missing_parameters=missing_parameters(
-            Evaluator(result.trials, result.space, setting.own_simulator, every_goal=False),
-            Linearisation(best.point, best.residuals if rows is None else best.residuals[rows],
-                          found.jacobian), setting.should_stop, parts=not setting.chooses_parts))
+            result.space, setting.evaluate, Linearisation(
+                best.point, best.residuals if rows is None else best.residuals[rows], found.jacobian),
+            parts=not setting.chooses_parts))
     except CancelledError:
         return result
 

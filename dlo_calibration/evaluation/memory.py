@@ -18,7 +18,7 @@ from dlo_calibration.evaluation.log import digest, Entry, EVALUATION, Evaluation
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.protocol import Rollout, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
 
 ERRORS = len(fields(PointErrors))
 
@@ -139,22 +139,32 @@ class _RememberingSimulator:
         self._simulator.prepare()
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        key = f'{ROLLOUT}-{digest(self._engine, self.name, self._memory.digest(trial), physical)}'
-        entry = self._memory.find(key)
-        if entry is not None:
-            if not len(entry.numbers):
-                raise SimulationError(entry.text)
-            rollout = _rollout(entry.numbers, len(trial.goals), len(trial.initial))
-            if rollout is not None:
-                return rollout
-        try:
-            found = self._simulator.simulate(trial, physical)
-        except SimulationError as error:
-            self._memory.add(key, Entry(np.zeros(0), str(error)))
-            raise
-        self._memory.add(key, Entry(np.array([
-            found.duration, found.steps, *found.settled, *found.chains.ravel()], float)))
+        found, = self.simulate_together([(trial, physical)])
+        if isinstance(found, SimulationError):
+            raise found
         return found
+
+    def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None] = lambda: None
+                          ) -> list[Rollout | SimulationError]:
+        keys = [f'{ROLLOUT}-{digest(self._engine, self.name, self._memory.digest(trial), physical)}'
+                for trial, physical in jobs]
+        found = [self._known(key, trial) for key, (trial, _) in zip(keys, jobs, strict=True)]
+        new = [k for k, one in enumerate(found) if one is None]
+        rollouts = simulate_all(self._simulator, [jobs[k] for k in new], between)
+        for k, one in zip(new, rollouts, strict=True):
+            found[k] = one
+            entry = Entry(np.zeros(0), str(one)) if isinstance(one, SimulationError) else Entry(
+                np.array([one.duration, one.steps, *one.settled, *one.chains.ravel()], float))
+            self._memory.add(keys[k], entry)
+        return [one for one in found if one is not None]
+
+    def _known(self, key: str, trial: Trial) -> Rollout | SimulationError | None:
+        entry = self._memory.find(key)
+        if entry is None:
+            return None
+        if not len(entry.numbers):
+            return SimulationError(entry.text)
+        return _rollout(entry.numbers, len(trial.goals), len(trial.initial))
 
     def refined(self) -> None:
         return None

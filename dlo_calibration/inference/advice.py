@@ -13,6 +13,7 @@ Design: A Review, 1995, section 2).
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Callable, Iterator, Sequence
 
@@ -35,7 +36,7 @@ from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
-from dlo_calibration.simulation.protocol import Simulator
+from dlo_calibration.simulation.protocol import simulate_all, Simulator
 
 MOST_SOUGHT = 6  # parameters for which an action is sought, so that many do not take long
 WORTH_IT = 0.8  # an action is advised if it reduces the standard deviation to less than this share
@@ -87,16 +88,19 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     :param uncertainty: the present one.
     :param length: of the DLO [m].
     :return: None if no action helps, every parameter is identifiable, or there is no covariance.
+    :raises CancelledError: when stopped.
     """
     if uncertainty.covariance is None:
         return None
     possible, known = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
 
-    def simulated(candidate: Candidate, shown: NDArray[np.bool_]) -> Floats | None:
-        try:
-            return sensitivity(candidate.trial, space, simulator, point, uncertainty.std, length, shown=shown)
-        except (SimulationError, InputError):
-            return None  # this DLO does not allow the action
+    def simulated(some: Sequence[Candidate], shown: NDArray[np.bool_]
+                  ) -> Iterator[tuple[Candidate, Floats | None]]:
+        found = sensitivities([one.trial for one in some], space, simulator, point, uncertainty.std, length,
+                              shown=np.tile(shown, (len(some), 1)), should_stop=should_stop)
+        for candidate, one in zip(some, found, strict=True):
+            # None: this DLO does not allow the action.
+            yield candidate, None if isinstance(one, SimulationError) else one
 
     sought: set[int] = set()
     for k in np.argsort(-uncertainty.std, kind='stable').tolist():
@@ -105,13 +109,11 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
             return None
         alone = np.arange(space.dimension) == k
         promising: list[tuple[float, Candidate, Floats]] = []
-        for candidate in list(possible):
-            if should_stop():
-                return None
-            if not excites([candidate.trial], space, np.inf)[0, k]:  # a table may be anywhere
-                continue
+        showing = [one for one in possible
+                   if excites([one.trial], space, np.inf)[0, k]]  # a table may be anywhere
+        if showing:
             sought.add(k)
-            matrix = simulated(candidate, alone)
+        for candidate, matrix in simulated(showing, alone):
             if matrix is None:
                 possible.remove(candidate)
                 continue
@@ -120,10 +122,9 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
             if at_best < WORTH_IT * now:
                 promising.append((at_best, candidate, matrix))
         best: tuple[float, Candidate] | None = None
-        for _, candidate, matrix in sorted(promising, key=lambda one: one[0])[:3]:
-            if should_stop():
-                return None
-            rest = simulated(candidate, ~alone)
+        promising = sorted(promising, key=lambda one: one[0])[:3]
+        others = simulated([one[1] for one in promising], ~alone)
+        for (_, candidate, matrix), (_, rest) in zip(promising, others, strict=True):
             if rest is not None:
                 std = float(standard_deviations(known + information(matrix + rest, uncertainty.scale))[k])
                 if std < WORTH_IT * now and (best is None or std < best[0]):
@@ -136,37 +137,49 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     return None
 
 
-def sensitivity(trial: Trial, space: ParameterSpace, simulator: Simulator, point: Floats, std: Floats,
-                length: float, *, shown: NDArray[np.bool_] | None = None, at_rest: bool = True) -> Floats:
+def sensitivities(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
+                  std: Floats, length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
+                  should_stop: Callable[[], bool] = lambda: False) -> list[Floats | SimulationError]:
     """
-    Return the (m, d) derivative of the simulated chains of a trial [m per unit cube].
+    Return the (m, d) derivative of the simulated chains of each trial [m per unit cube].
 
     The steps of the central differences are the standard deviations, because the chains may be nonlinear
     within such a distance.
 
     :param std: (d,) standard deviations in the unit cube.
     :param length: of the DLO [m].
-    :param shown: (d,) False for parameters that the trial cannot show: their columns are zero without a
-        rollout; None: all are simulated.
+    :param shown: (trials, d) False for parameters that a trial cannot show: their columns are zero without a
+        rollout.
     :param at_rest: whether to refuse a rollout that does not come to rest; if not, its last state counts.
-    :raises SimulationError: if a rollout diverges, or does not come to rest.
+    :return: in place of a derivative, why there is none: a rollout diverges, or does not come to rest.
+    :raises CancelledError: when stopped.
     """
-    columns: list[Floats] = []
+    def check() -> None:
+        if should_stop():
+            raise CancelledError
+
     steps = np.clip(std, STEP, WIDEST)
-    for k in range(len(point)):
-        if shown is not None and not shown[k]:
-            columns.append(np.zeros(3 * len(trial.goals) * len(trial.initial)))
-            continue
-        beside, chains = both_sides(point, [k], steps), []
-        for one in beside:
-            rollout = simulator.simulate(trial, space.physical(space.values(one), length))
-            if at_rest and not all(rollout.settled):
-                raise SimulationError(f'trial {trial.name!r} does not come to rest')
-            chains.append(rollout.chains.ravel())
-        column = slope(beside[:, k], chains)
-        assert column is not None  # both sides were simulated
-        columns.append(column)
-    return np.stack(columns, axis=1)
+    beside = [both_sides(point, [k], steps) for k in range(len(point))]
+    physical = [[space.physical(space.values(one), length) for one in both] for both in beside]
+    jobs = [(trial, one) for trial, row in zip(trials, shown, strict=True)
+            for k in np.flatnonzero(row) for one in physical[k]]
+    rollouts = simulate_all(simulator, jobs, check)
+    found: list[Floats | SimulationError] = []
+    for trial, row in zip(trials, shown, strict=True):
+        matrix, failure = np.zeros((3 * len(trial.goals) * len(trial.initial), len(point))), None
+        for k in np.flatnonzero(row):
+            chains = []
+            for one in (next(rollouts), next(rollouts)):
+                if isinstance(one, SimulationError):
+                    failure = one
+                elif at_rest and not all(one.settled):
+                    failure = SimulationError(f'trial {trial.name!r} does not come to rest')
+                else:
+                    chains.append(one.chains.ravel())
+            if failure is None:
+                matrix[:, k] = slope(beside[k][:, k], chains)
+        found.append(matrix if failure is None else failure)
+    return found
 
 
 def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:

@@ -22,7 +22,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.linearisation import Linearisation, STEP, WIDEST
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
-from dlo_calibration.inference.advice import sensitivity
+from dlo_calibration.inference.advice import sensitivities
 from dlo_calibration.inference.examination import extended
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
@@ -246,8 +246,10 @@ class Appraiser:
     def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
         shown, seen = excites([trial], self.space, self.table_height)[0], self._simulated(trial, point)
-        jacobian = sensitivity(trial, self.space, self.simulator, point, std, self.length, shown=shown,
-                               at_rest=False)
+        jacobian, = sensitivities([trial], self.space, self.simulator, point, std, self.length,
+                                  shown=shown[None], at_rest=False)
+        if isinstance(jacobian, SimulationError):
+            raise jacobian
         rows = np.repeat(seen_points(trial).ravel(), 3)
         return TrialModel(Linearisation(point, seen, jacobian[rows]), np.zeros((0, len(seen))))
 

@@ -10,7 +10,7 @@ from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.linearisation import Linearisation, perpendicular
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
@@ -42,9 +42,8 @@ class MissingParameter:
     share: float
 
 
-def missing_parameters(evaluator: Evaluator, fit: Linearisation,
-                       should_stop: Callable[[], bool] = lambda: False, parts: bool = True
-                       ) -> tuple[MissingParameter, ...]:
+def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace], BatchEvaluator],
+                       fit: Linearisation, parts: bool = True) -> tuple[MissingParameter, ...]:
     """
     Return the parameters that would explain at least a tenth of the squared residuals, largest share first.
 
@@ -52,7 +51,8 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
     effect counts that the free parameters cannot imitate (a score test: Rao,
     Linear Statistical Inference and Its Applications, 1973, 6e.3).
 
-    :param evaluator: of the calibration; it compares the goals that `fit` does.
+    :param space: of the calibration.
+    :param evaluate: returns an evaluator for another space, which compares the goals that `fit` does.
     :param fit: the residuals at the found parameters, linearised.
     :param parts: False: the calibration has tried parts of different stiffness.
     :raises CancelledError: when stopped.
@@ -60,14 +60,12 @@ def missing_parameters(evaluator: Evaluator, fit: Linearisation,
     roots = Huber.of(fit.residuals).roots(fit.residuals)
     weighted = fit.weighted(roots)
     left = perpendicular(weighted.jacobian, weighted.residuals)
+    begun = [(name, evaluate(wider).begin(np.hstack([np.tile(fit.point, (len(moves), 1)), moves])))
+             for name, wider, moves in _candidates(space, parts)]
     found = []
-    for name, wider, moves in _candidates(evaluator.space, parts):
-        wide = evaluator.of(wider)
-        columns = []
-        for move in moves:
-            seen = wide.evaluate(0, np.concatenate([fit.point, move]), should_stop).residuals
-            if seen is not None:
-                columns.append(perpendicular(weighted.jacobian, roots * (seen - fit.residuals)))
+    for name, residuals in begun:
+        columns = [perpendicular(weighted.jacobian, roots * (seen - fit.residuals))
+                   for seen in residuals() if seen is not None]
         share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
         if share >= 0.1:
             found.append(MissingParameter(name, share))
