@@ -11,7 +11,7 @@ import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, read_session, Trial
 from dlo_calibration.model.parameters import knot_names, ParameterSpace
-from dlo_calibration.simulation import kernels, kernels_together  # noqa: F401  # compiled, if it was not
+from dlo_calibration.simulation import kernels, kernels_together, rope  # noqa: F401  # compiled, if it was not
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
 
@@ -173,13 +173,13 @@ def test_parts(benchmark, nodes, tables, monkeypatch):
     """Measure kernels where Python calls them, and self-contact as the time saved without it."""
     trials, physical = object1()
     simulator = CompiledSimulator(nodes=nodes)
-    advance, start = kernels.advance, kernels.start_distances
+    advance, start = kernels.advance, rope.start_distances
     whole, kernel, distances, contact = [], [], [], []
 
     def measure(prepare=lambda arguments: None):
         watches = Watch(advance, prepare), Watch(start)
         monkeypatch.setattr(kernels, 'advance', watches[0])
-        monkeypatch.setattr(kernels, 'start_distances', watches[1])
+        monkeypatch.setattr(rope, 'start_distances', watches[1])
         begun = time.process_time()
         steps = sum(simulator.simulate(trial, physical).steps for trial in trials)
         return time.process_time() - begun, *(watch.seconds for watch in watches), steps

@@ -32,8 +32,11 @@ KERNELS: dict[str, str] = {
     'dlo_calibration.simulation.kernels_together': 'simulation of several trials at once',
     'dlo_calibration.capture.path': 'tracer'}
 SIMULATION, TOGETHER, TRACER = KERNELS
-#: name of a module with kernels -> other files that its machine code depends on
-_SOURCES = {'kernels': ('lanes.py',), 'kernels_together': ('kernels.py', 'lanes.py')}
+#: name of a module with kernels -> modules whose kernels are compiled with its own
+_PARTS = {'kernels': ('kernels_carry', 'kernels_contact', 'kernels_frame', 'kernels_near', 'kernels_slip')}
+#: name of a module with kernels -> other modules that its machine code depends on
+_SOURCES = {'kernels': ('compilation', 'lanes', *_PARTS['kernels']),
+            'kernels_together': ('compilation', 'lanes', 'kernels', *_PARTS['kernels'])}
 
 
 def settle(folder: Path) -> None:
@@ -51,7 +54,7 @@ def settle(folder: Path) -> None:
         if (beside / name).exists() and not (users / name).exists():
             with suppress(OSError):  # then they are compiled once more
                 users.mkdir(parents=True, exist_ok=True)
-                for one in [*beside.glob(f'{file.stem}.*.nb[ic]'), beside / name]:
+                for one in [*_code(file, beside), beside / name]:
                     shutil.copyfile(one, users / one.name)
 
 
@@ -76,7 +79,7 @@ def compile_kernels(module: str) -> None:
     with suppress(OSError):
         if not (folder / mark).exists() and not begun.exists():
             # Numba does not notice that another module has changed; after an interruption it may go on.
-            for old in folder.glob(f'{_file(module).stem}.*.nb[ic]'):
+            for old in _code(_file(module), folder):
                 old.unlink()
             folder.mkdir(parents=True, exist_ok=True)
             begun.touch()
@@ -96,6 +99,12 @@ def remark() -> str:
 
 def _file(module: str) -> Path:
     return _PACKAGE.joinpath(*module.split('.')[1:]).with_suffix('.py')
+
+
+def _code(file: Path, folder: Path) -> list[Path]:
+    """Return the files in a folder with the machine code of a module's kernels."""
+    stems = file.stem, *_PARTS.get(file.stem, ())
+    return [one for stem in stems for one in folder.glob(f'{stem}.*.nb[ic]')]
 
 
 def _users() -> Path:
@@ -130,7 +139,7 @@ def _until_the_next_boot(make: bool = True) -> Path:
 
 def _mark(file: Path) -> str:
     """Return the name of the file that tells that a module's kernels, as they are now, were compiled here."""
-    sources = [file, *(file.with_name(name) for name in _SOURCES.get(file.stem, ()))]
+    sources = [file, *(file.with_name(f'{name}.py') for name in _SOURCES.get(file.stem, ()))]
     return _mark_of(file.stem, tuple((one, one.stat().st_mtime_ns) for one in sources if one.exists()))
 
 

@@ -14,28 +14,22 @@ from typing import Any, NamedTuple
 
 import numba
 
-from dlo_calibration.simulation.kernels import (
+from dlo_calibration.simulation.compilation import (
     Cube,
     entry,
-    FrameState,
     IndexRows,
     Indices,
-    is_near,
-    keep_apart,
-    let_follow,
     Matrix,
-    movement,
     part,
     record,
-    rest_on_table,
-    rod_velocities,
-    RodState,
-    SelfContact,
-    SlipState,
-    turn_clamps,
     TYPES,
     Vector,
 )
+from dlo_calibration.simulation.kernels import let_follow, rest_on_table, rod_velocities, RodState
+from dlo_calibration.simulation.kernels_contact import keep_apart, SelfContact
+from dlo_calibration.simulation.kernels_frame import FrameState, turn_clamps
+from dlo_calibration.simulation.kernels_near import is_near, movement
+from dlo_calibration.simulation.kernels_slip import SlipState
 from dlo_calibration.simulation.lanes import COUNT, lanes_of, where
 
 GOES_ON, STABLE, DIVERGED = 0, 1, 2

@@ -51,7 +51,9 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import knot_names, KNOTS, PART_NAMES
-from dlo_calibration.simulation.kernels import BAND, FrameState, RodState, SlipState
+from dlo_calibration.simulation.kernels import BAND, RodState
+from dlo_calibration.simulation.kernels_frame import FrameState
+from dlo_calibration.simulation.kernels_slip import SlipState
 
 _KNOT_NAMES = knot_names(KNOTS[-1])
 

@@ -12,7 +12,9 @@ import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.kernels import RopeState
+from dlo_calibration.simulation.kernels_contact import CONTACT, SelfContact
+from dlo_calibration.simulation.kernels_near import start_distances
 from dlo_calibration.simulation.rod import Rod, RodProperties
 
 
@@ -40,9 +42,9 @@ class Rope:
             directions, np.diff(points, axis=0), places, properties.clamp_twist)
         points = np.array(points, dtype=float)
         contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
-        kernels.start_distances(contact, points)
+        start_distances(contact, points)
         #: state of the kernels, which change positions and velocities in place
-        self.state = kernels.RopeState(
+        self.state = RopeState(
             points=points, velocities=np.array(velocities, dtype=float), predicted=np.zeros_like(points),
             support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
             contact=contact)
@@ -82,7 +84,7 @@ def _in_clamps(directions: Floats, segments: Floats, places: Floats, twist: floa
     return found
 
 
-def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernels.SelfContact:
+def self_contact(rest_lengths: Floats, radius: float, friction: float) -> SelfContact:
     """
     Return the state of contact of a DLO with itself.
 
@@ -94,11 +96,11 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> kernel
     segments = len(half)
     count, apart = segments * (segments - 1) // 2, max(np.pi * radius, float(half.max()))
     beyond = np.flatnonzero(widest > apart)
-    return kernels.SelfContact(
+    return SelfContact(
         half=half, middles=middles, diameter=2.0 * radius, apart=apart, friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
         near=np.zeros(1, np.int64), room=np.full(3, -1.0),
-        contacts=np.empty(count, kernels.CONTACT),
+        contacts=np.empty(count, CONTACT),
         change=np.empty((segments + 1, 3)), balls=np.empty((8, segments)),
         overlaps=np.zeros(1, np.int64), next_one=int(beyond[0]) if len(beyond) else segments)
 
@@ -108,7 +110,7 @@ def _widest_gaps(lengths: bytes) -> tuple[Floats, Floats, Floats]:
     """
     Return what depends on the lengths of S segments alone, each (S,) [m].
 
-    :returns: `half` and `middles` of `kernels.SelfContact`; the largest arc length between two segments, by
+    :returns: `half` and `middles` of `SelfContact`; the largest arc length between two segments, by
         how many segments one is further than the other.
     """
     rest_lengths = np.frombuffer(lengths)

@@ -18,9 +18,9 @@ from dlo_calibration import Chain, SimulationError
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.parameters import PARAMETERS, ParameterSpace, REST_SHAPE
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration.simulation.kernels_carry import HAIRPIN
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.rod import RodProperties
 
@@ -45,7 +45,7 @@ def test_the_compiled_step_is_that_of_the_rod(seed, segments, held, curvature, s
     points = crumpled(seed, rest, size)
     count = len(points)
     tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
-    assume((1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 > kernels.HAIRPIN)
+    assume((1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 > HAIRPIN)
     velocities = generator.normal(size=points.shape)
     nodes = np.sort(generator.choice(count, min(held, count - 1), replace=False))
     follow = generator.normal(size=(len(nodes), 3))

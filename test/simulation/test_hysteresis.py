@@ -12,10 +12,10 @@ from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation import kernels
 from dlo_calibration.simulation.bullet import BulletRope
 from dlo_calibration.simulation.bullet_world import pybullet
 from dlo_calibration.simulation.compiled import CompiledRope
+from dlo_calibration.simulation.kernels_slip import rub, SlipState
 from dlo_calibration.simulation.rod import RodProperties
 
 STIFFNESS, KEPT, SLIP = 1e-3, 2.0, 0.5
@@ -32,7 +32,7 @@ def moments(curvatures, steps=50):
             angle = length * now / 2
             end = length * np.array([np.cos(angle), np.sin(angle), 0])
             points = np.array([end * (-1, 1, 1), (0, 0, 0), end])
-            kernels.rub(rod.state.friction, points, 1e-9)
+            rub(rod.state.friction, points, 1e-9)
         found.append(-rod.state.friction.pull[1, 4] / 1e-9 * length / 2)
         before = curvature
     return np.array(found)
@@ -59,8 +59,8 @@ def test_the_loop_does_not_depend_on_the_rate():
 
 def stored(rod, points):
     """Return the energy [J] in the elements at these points."""
-    state = kernels.SlipState(*(array.copy() for array in rod.state.friction))
-    kernels.rub(state, points, rod.state.step)
+    state = SlipState(*(array.copy() for array in rod.state.friction))
+    rub(state, points, rod.state.step)
     return (state.rows[:, 3] * (state.kept[:, 6:]**2).sum(axis=1)).sum() / 2
 
 

@@ -5,11 +5,20 @@
 
 import os
 from pathlib import Path
+import re
+import shutil
 
 import pytest
 
 from dlo_calibration.simulation import kernel_cache
-from dlo_calibration.simulation.kernel_cache import is_compiled, place, remark, settle, SIMULATION
+from dlo_calibration.simulation.kernel_cache import (
+    is_compiled,
+    place,
+    remark,
+    settle,
+    SIMULATION,
+    TOGETHER,
+)
 
 
 @pytest.fixture
@@ -27,6 +36,7 @@ def package(tmp_path, monkeypatch):
     kept = place(SIMULATION)
     assert kept == folder / '__pycache__'
     for name in ('kernels.advance-1.py311.nbi', 'kernels.advance-1.py311.1.nbc',
+                 'kernels_near.movement-1.py311.nbi', 'kernels_near.movement-1.py311.1.nbc',
                  kernel_cache._mark(folder / 'kernels.py')):
         (kept / name).write_text(name)
     denied = []
@@ -74,6 +84,25 @@ def test_a_folder_that_others_can_write_is_not_trusted(package, tmp_path):
     open_to_all.chmod(0o777)
     protect(folder, tmp_path / 'home')
     assert Path(os.environ['NUMBA_CACHE_DIR']) != open_to_all
+
+
+@pytest.mark.parametrize('module', [SIMULATION, TOGETHER])
+def test_a_change_of_any_module_with_kernels_compiles_all_that_are_made_of_it(module, tmp_path):
+    folder = Path(kernel_cache.__file__).parent
+    names, unread = set(), {module.rpartition('.')[2]}
+    while unread:
+        text = (folder / f'{unread.pop()}.py').read_text(encoding='utf-8')
+        found = set(re.findall(r'^from dlo_calibration\.simulation\.(\w+) import', text, re.MULTILINE))
+        unread |= found - names
+        names |= found
+    assert len(names) > 5
+    shutil.copytree(folder, tmp_path / 'copy', ignore=shutil.ignore_patterns('__pycache__'))
+    main = tmp_path / 'copy' / f'{module.rpartition(".")[2]}.py'
+    for name in names:
+        before = kernel_cache._mark(main)
+        with (tmp_path / 'copy' / f'{name}.py').open('a', encoding='utf-8') as file:
+            file.write('# changed\n')
+        assert kernel_cache._mark(main) != before, name
 
 
 def test_numba_keeps_the_kernels_where_the_cache_says():

@@ -12,7 +12,7 @@ from random_examples import drawing
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.kernels_carry import HAIRPIN
 from dlo_calibration.simulation.rod import RodProperties
 
 
@@ -70,7 +70,7 @@ def test_a_coiled_weightless_cantilever_takes_the_arc():
 def tight(points):
     """Tell whether two segments almost fold onto each other, where energies are limited."""
     tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
-    return (1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 <= 2 * kernels.HAIRPIN
+    return (1 + (tangents[1:] * tangents[:-1]).sum(axis=1).min()) / 2 <= 2 * HAIRPIN
 
 
 @drawing(12, derandomize=True)

@@ -7,18 +7,18 @@ import math
 
 import numpy as np
 
-from dlo_calibration.simulation.kernels import (
+from dlo_calibration.simulation.kernels import HELD
+from dlo_calibration.simulation.kernels_carry import HAIRPIN
+from dlo_calibration.simulation.kernels_contact import (
     FASTEST_PUSH_OUT,
-    HAIRPIN,
-    HELD,
     ITERATIONS,
     PUSH_OUT,
-    ROUNDED,
     SUPPORTED,
     TINY,
     UNSUPPORTED,
     WEDGED,
 )
+from dlo_calibration.simulation.kernels_frame import ROUNDED
 
 
 def rod_velocities(rod, points, velocities):

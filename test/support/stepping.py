@@ -6,7 +6,10 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.kernels import rod_velocities
+from dlo_calibration.simulation.kernels_contact import keep_apart
+from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
+from dlo_calibration.simulation.kernels_near import is_near, movement, near_pairs, start_distances
 from dlo_calibration.simulation.rod import Rod
 from dlo_calibration.simulation.rope import self_contact
 
@@ -21,8 +24,8 @@ class SteppedRod(Rod):
         self.state.follow[:] = held_velocities
         wanted = np.empty_like(points)
         pushed = velocities + self.state.step * gravity
-        assert kernels.rod_velocities(self.state, points, pushed, wanted)
-        kernels.turn_clamps(self.state.frame.clamped, self.state.frame.clamps, turns)
+        assert rod_velocities(self.state, points, pushed, wanted)
+        turn_clamps(self.state.frame.clamped, self.state.frame.clamps, turns)
         return wanted
 
     def frame_forces(self, points, times=1):
@@ -31,7 +34,7 @@ class SteppedRod(Rod):
             self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.state.held), 3)))
         impulses = np.zeros(points.size)
         if len(self.state.frame.angles):
-            kernels.add_frame(self.state.frame, 1.0, impulses)
+            add_frame(self.state.frame, 1.0, impulses)
         return impulses.reshape(-1, 3)
 
     def turned(self, points, axes):
@@ -55,18 +58,18 @@ class Touching:
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
-        kernels.start_distances(self.state, points)
+        start_distances(self.state, points)
 
     def check_every_pair(self, points):
         """Check every pair of segments in the coming steps, however far apart they are."""
-        self.state.near[0] = kernels.near_pairs(self.state, points, 1.2, np.inf)
+        self.state.near[0] = near_pairs(self.state, points, 1.2, np.inf)
         self.state.room[:] = -1.0, -1.0, np.inf
 
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         allowed = velocities.copy()
-        coming = kernels.movement(allowed, self._step)
-        if kernels.is_near(self.state, points, self._last, coming):
-            kernels.keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
-        self._last = kernels.movement(allowed, self._step)
+        coming = movement(allowed, self._step)
+        if is_near(self.state, points, self._last, coming):
+            keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
+        self._last = movement(allowed, self._step)
         return allowed
