@@ -6,8 +6,8 @@ Kernels: one step of a DLO, compiled by Numba.
 
 They compute the rod's internal forces and a table with friction.  The frame, hysteresis and contact of the
 DLO with itself are in `kernels_frame`, `kernels_slip` and `kernels_contact`.  Numba's cache keeps the machine
-code, so that it is compiled once per machine.  Numba notices only changes of the file that a kernel is in, not
-of the kernels that it calls: `kernel_cache` knows which other files they depend on.
+code, so that it is compiled once per machine.  Numba notices only changes of the file that a kernel is in,
+not of the kernels that it calls: `kernel_cache` knows which other files they depend on.
 """
 
 from __future__ import annotations
