@@ -433,6 +433,7 @@ def test_each_thread_has_a_simulator_of_its_own_until_the_next_calibration_or_it
     assert not hasattr(simulator, 'home')
 
 
+@pytest.mark.long
 def test_threads_give_the_result_of_pybullet_bit_for_bit():
     bullet = pytest.importorskip('dlo_calibration.simulation.bullet')
     trials = [replace(trial, goals=(Goal(trial.goals[0].chain, 1.6),)) for trial in TRIALS[:1]]

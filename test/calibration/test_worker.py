@@ -223,6 +223,7 @@ def gone(pids):
     return False
 
 
+@pytest.mark.long
 def test_processes_do_not_import_the_main_module_and_end_with_a_killed_parent(parent):
     assert parent.stdout.readline() == 'False\n'
     children = spawned(parent.pid, 2)

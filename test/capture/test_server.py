@@ -352,6 +352,7 @@ def test_the_board_can_be_printed_from_the_page_and_the_command_line(shared, tmp
     assert '100 %' in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_kill_loses_nothing_and_a_signal_ends_it_well(tmp_path):
     folder = tmp_path / 'project'
     words = '--evaluations', 100000, '--search', 'random', '--workers', 1

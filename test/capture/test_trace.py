@@ -133,7 +133,7 @@ def test_clicks_that_cannot_be_used_get_one_sentence(clicked, said):
         Tracer(EMPTY).trace(clicked)
 
 
-@pytest.mark.parametrize('ground', ['plain', 'wood', None])
+@pytest.mark.parametrize('ground', [pytest.param('plain', marks=pytest.mark.long), 'wood', None])
 def test_where_there_is_no_dlo_it_says_so(ground):
     if ground is None:
         pixels = np.full((900, 1200, 3), 128, dtype=np.uint8)

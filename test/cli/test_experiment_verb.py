@@ -194,6 +194,7 @@ def started(session, out, workers):
     return process
 
 
+@pytest.mark.long
 def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, undrawn):
     out = tmp_path / 'out'
     process = started(session, out, 2)

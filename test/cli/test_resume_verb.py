@@ -84,6 +84,7 @@ def told(folder):
         SESSION, EVALUATIONS))]
 
 
+@pytest.mark.long
 def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
     code, _, _, whole = act('fit', session, '--output', tmp_path / 'whole', *FLAGS)
     assert code == 0

@@ -109,6 +109,7 @@ def same(first, second):
     assert [e.score for e in first.evaluations] == [e.score for e in second.evaluations]
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines, capfd):
     address, processes = machines
     alone = calibrate(toy_trials(2), options(), make_simulator=new_toy)
@@ -170,6 +171,7 @@ def test_an_evaluation_that_kills_as_many_workers_as_allowed_ends_with_what_to_d
             calibrate(toy_trials(1), options(address), make_simulator=lambda _: Deadly())
 
 
+@pytest.mark.long
 def test_the_last_worker_has_a_while_to_come_back(scheduler, start_worker, monkeypatch):
     monkeypatch.setattr(cluster, 'RETURN', 1.0)
     told = []

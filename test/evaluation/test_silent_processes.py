@@ -60,6 +60,7 @@ def test_a_process_that_hangs_is_replaced_and_one_that_is_slow_is_not(tmp_path):
     assert told == [TOLD, TOLD]
 
 
+@pytest.mark.long
 def test_a_call_that_always_hangs_is_given_up(monkeypatch):
     monkeypatch.setattr('dlo_calibration.evaluation.processes.DEATHS', 1)
     with closing(ProcessExecutor(1, answer_limit=1.0)) as executor:

@@ -312,6 +312,7 @@ def test_killed_at_any_moment_a_session_reads_up_to_its_last_complete_message(tm
     assert all(count >= 3 * turn for turn, count in enumerate(counts))  # the moments were different ones
 
 
+@pytest.mark.long
 def test_node_killed_while_it_records_loses_nothing_that_it_told(ros_environment, tmp_path, command):
     import graph
 

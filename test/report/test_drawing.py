@@ -67,6 +67,7 @@ def test_picture_of_a_session_has_a_row_per_trial(tmp_path):
     assert 1.7 * one.height < both.height < 2.05 * one.height
 
 
+@pytest.mark.long
 def test_picture_does_not_depend_on_what_was_drawn_before():
     first, second = toy_trials(2)
     once = trial_png(first, chains_of(first))

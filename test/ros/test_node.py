@@ -297,6 +297,7 @@ def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_pa
         assert (folder / 'metadata.yaml').exists()
 
 
+@pytest.mark.long
 def test_killed_node_leaves_a_readable_session_and_no_processes(ros_environment, tmp_path, capsys):
     with child(ros_environment, tmp_path / 'out', '-p', 'workers:=2', '-p', 'evaluations:=10000',
                seconds=0.01) as process, robot_of(ros_environment) as robot:

@@ -15,7 +15,7 @@ LOG_WARN = 30  # rcl_interfaces/msg/Log
 
 @contextmanager
 def live_node(environment, folder, toy=None, **parameters):
-    """Give the robot of `graph` with a node in this process; skip where there is no ROS."""
+    """Give the robot of `graph` with a node in this process that tells at once; skip where there is no ROS."""
     from graph import robot_of
     from rclpy.parameter import Parameter
 
@@ -24,6 +24,7 @@ def live_node(environment, folder, toy=None, **parameters):
     with robot_of(environment) as robot, pytest.MonkeyPatch.context() as patch:
         leave_out_drawings(patch.setattr)
         leave_out_slices(patch.setattr)
+        patch.setattr('dlo_calibration.ros.outlet.Outlet.status_period', 0.05)
         robot.calibrator = CalibratorNode(
             lambda _: toy or ToySimulator(), context=robot.context, parameter_overrides=[
                 Parameter(name, value=value)
