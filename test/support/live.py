@@ -15,7 +15,7 @@ LOG_WARN = 30  # rcl_interfaces/msg/Log
 
 @contextmanager
 def live_node(environment, folder, toy=None, **parameters):
-    """Give the robot of `graph` with a node in this process that tells at once; skip where there is no ROS."""
+    """Give the robot of `graph` with a node in this process, which tells at once; skip without ROS."""
     from graph import robot_of
     from rclpy.parameter import Parameter
 
