@@ -72,7 +72,7 @@ class CompiledRope(Rope):
 
 
 class CompiledSimulator(Engine):
-    """Simulates trials on a table or in the air, 20 to 30 times as fast as `bullet.BulletSimulator`."""
+    """Simulates trials on a table or in the air, about 40 times as fast as `bullet.BulletSimulator`."""
 
     name = 'compiled'
 
