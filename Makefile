@@ -79,7 +79,8 @@ soak: $(STAMP)
 figures: bench
 	@$(PYTHON) benchmark/searches.py
 	$(PYTHON) benchmark/ladder.py
-	$(PYTHON) benchmark/export_mujoco.py
+	$(PYTHON) benchmark/export_mujoco.py cantilever hanging flexcomp minute
+	$(PYTHON) benchmark/export_mujoco.py trials $(if $(MEASURED),--other)
 	$(PYTHON) benchmark/capture.py
 	$(PYTHON) benchmark/first_day.py
 	if ! pkg-config --exists ignition-physics5 sdformat12 2>/dev/null; then
