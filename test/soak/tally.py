@@ -11,10 +11,10 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 MEGABYTE = 1e6  # bytes
+POLL = 0.02  # s between two looks at the memory of a process
 
 
 @dataclass
@@ -81,23 +81,21 @@ def finish(*command: object, folder: Path, limit: float = 60.0, environment: dic
     with (folder / 'out').open('w+b') as out, (folder / 'err').open('w+b') as err:
         process = subprocess.Popen([str(part) for part in command], stdin=subprocess.DEVNULL, stdout=out,
                                    stderr=err, cwd=folder, env={**os.environ, **(environment or {})})
-        killed = threading.Event()
-
-        def kill() -> None:
-            killed.set()
-            os.kill(process.pid, signal.SIGKILL)  # unlike send_signal, this never waits for the process
-
-        clock = threading.Timer(limit, kill)
-        clock.start()
-        _, status, usage = os.wait4(process.pid, 0)  # unlike subprocess, it tells the memory
-        clock.cancel()
+        ended, status, peak, killed = 0, 0, 0, False
+        while not ended:
+            # What the system tells at its end contains the memory of this process, from which it began.
+            peak = max(peak, peak_of(process.pid))
+            if not killed and time.monotonic() - begun > limit:
+                os.kill(process.pid, signal.SIGKILL)
+                killed = True
+            time.sleep(POLL)
+            ended, status = os.waitpid(process.pid, os.WNOHANG)
         process.returncode = os.waitstatus_to_exitcode(status)
         texts = []
         for stream in (out, err):
             stream.seek(0)
             texts.append(stream.read().decode(errors='replace'))
-    return Ended(None if killed.is_set() else process.returncode, *texts, usage.ru_maxrss * 1024,
-                 time.monotonic() - begun)
+    return Ended(None if killed else process.returncode, *texts, peak, time.monotonic() - begun)
 
 
 def verb(*arguments: object, folder: Path, limit: float = 60.0) -> Ended:

@@ -3,9 +3,7 @@
 
 """A little of the campaigns of `make soak` that show more than all other tests: memory, and native code."""
 
-from contextlib import suppress
 import importlib
-from pathlib import Path
 
 import pytest
 from soak import CAMPAIGNS
@@ -20,9 +18,6 @@ def test_every_campaign_can_be_conducted(name):
 
 @pytest.mark.parametrize(('name', 'amount'), [('bombs', 1), ('scenes', 10)])
 def test_nothing_is_lost_and_nothing_dies(name, amount, tmp_path):
-    # A child begins with the peak of its parent, in which other tests may have needed much: forget it.
-    with suppress(OSError):
-        Path('/proc/self/clear_refs').write_text('5')
     tally = importlib.import_module(name).conduct(amount, 1, tmp_path)
     assert tally.tried == amount
     assert (tally.lost, tally.died) == (0, 0)
