@@ -10,7 +10,7 @@ from typing import Callable, Mapping, Sequence
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, simulate_one, Simulator
 
 PERIOD = 0.05  # s between two calls of `between`
 
@@ -35,10 +35,7 @@ class Executed:
 
         :raises SimulationError: if the rollout diverges.
         """
-        found, = self.simulate_together([(trial, physical)])
-        if isinstance(found, SimulationError):
-            raise found
-        return found
+        return simulate_one(self, (trial, physical))
 
     def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None] = lambda: None
                           ) -> list[Rollout | SimulationError]:

@@ -18,7 +18,7 @@ from dlo_calibration.evaluation.log import digest, Entry, EVALUATION, Evaluation
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, simulate_one, Simulator
 
 ERRORS = len(fields(PointErrors))
 
@@ -139,10 +139,7 @@ class _RememberingSimulator:
         self._simulator.prepare()
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        found, = self.simulate_together([(trial, physical)])
-        if isinstance(found, SimulationError):
-            raise found
-        return found
+        return simulate_one(self, (trial, physical))
 
     def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None] = lambda: None
                           ) -> list[Rollout | SimulationError]:

@@ -110,6 +110,6 @@ def _check(should_stop: Callable[[], bool]) -> None:
 
 
 def _load(make_simulator: SimulatorFactory, simulation: Options) -> None:
-    """Load all that simulations need."""
+    """Make an engine, which reads its scene and compiles the kernels if they are not."""
     with closing(make_simulator(simulation)) as simulator:
         simulator.prepare()

@@ -105,6 +105,18 @@ class TogetherSimulator(Protocol):
         """
 
 
+def simulate_one(simulator: TogetherSimulator, job: Job) -> Rollout:
+    """
+    Return the rollout of one job by a simulator that takes several.
+
+    :raises SimulationError: if it failed.
+    """
+    found, = simulator.simulate_together([job], lambda: None)
+    if isinstance(found, SimulationError):
+        raise found
+    return found
+
+
 def simulate_all(simulator: Simulator, jobs: Sequence[Job], between: Callable[[], None]
                  ) -> Iterator[Rollout | SimulationError]:
     """Yield the rollout of each job, or why it failed; together if the simulator can."""
