@@ -117,8 +117,7 @@ LOADED = (
     ((['info', 'msg_samples/object1'], ['info', 'msg_samples/xml/named_actions.xml'], ['--help']), set()),
     ((['plot', 'msg_samples/xml/push_and_release.xml'],), {'matplotlib'}),
     # The processes that simulate load the kernels, and PyBullet.
-    ((['fit', 'msg_samples/object1', *'--workers 2 --calibrate friction --evaluations 4'.split()],),
-     {'scipy'}),
+    ((['fit', 'msg_samples/object1', *'--workers 2 --calibrate friction --evaluations 4'.split()],), set()),
 )
 
 

@@ -23,6 +23,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
+from dlo_calibration.search.bounded import bounded_least_squares
 
 PARTS = 'parts'  # stands for parts of different bending stiffness
 MOVE = 0.15  # change of a parameter, in the unit cube: well above the noise of a simulation
@@ -103,14 +104,13 @@ def _is_absent(parameter: Parameter, now: float) -> bool:
 
 def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:
     """Return the share of the squares of `left` (m,) that a bounded combination of (m,) columns explains."""
-    from scipy.optimize import lsq_linear
-
     matrix = np.stack(columns, axis=1) if columns else np.zeros((len(left), 0))
     total = float(left @ left)
     if not total > 0 or not float(np.square(matrix).sum()) > 0:
         return 0.0
     # An effect that is absent at its default cannot be negative.
     least = 0.0 if parameter is not None and parameter.neutral == 0 else -FURTHEST
-    steps = lsq_linear(matrix, -left, (least, FURTHEST), method='bvls').x
+    bounds = np.full(len(columns), least), np.full(len(columns), FURTHEST)
+    steps = bounded_least_squares(matrix, -left, *bounds)
     rest = left + matrix @ steps
     return 1 - float(rest @ rest) / total

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.model.chain import Floats
+from dlo_calibration.search.bounded import bounded_least_squares
 from dlo_calibration.search.protocol import Observation
 
 #: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
@@ -81,8 +82,6 @@ class Descent:
 
     def step(self, radius: float) -> Floats:
         """Return the (d,) step that minimises the model within the unit cube and the radius."""
-        from scipy.optimize import lsq_linear
-
         free = self.visible()
         step = np.zeros(len(self.point))
         least = np.maximum(-self.point, -radius)[free]
@@ -98,8 +97,7 @@ class Descent:
         damping = 1e-4 * np.linalg.norm(model.jacobian, axis=0).max()
         upper = np.concatenate([upper, damping * np.eye(len(columns))])
         rest = np.concatenate([rest, np.zeros(len(columns))])
-        solution = lsq_linear(upper, rest, (least[movable], most[movable]), method='bvls')
-        step[columns] = solution.x
+        step[columns] = bounded_least_squares(upper, rest, least[movable], most[movable])
         return step
 
     def predicted(self, step: Floats) -> float:

@@ -17,6 +17,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, NEAR
 from dlo_calibration.search.plan import Plan, PlannedSearch
 from dlo_calibration.search.protocol import Hints, Observation
+from dlo_calibration.search.sobol import Sobol
 
 # Steps and distances are in the unit cube.
 FIRST_STEP = 0.015  # of a finite difference; larger steps mislead beside a narrow valley
@@ -191,11 +192,9 @@ class LeastSquares(PlannedSearch):
 
     def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
         """Ask for start points until at least one can be simulated."""
-        from scipy.stats import qmc
-
         # Two per parameter and at least eight; a Sobol sequence is balanced only for powers of two.
         count = 2 ** int(np.ceil(np.log2(max(8, 2 * self._dimension))))
-        sobol = qmc.Sobol(self._dimension, scramble=True, seed=self._seed)
+        sobol = Sobol(self._dimension, self._seed)
         hint = np.clip(self._hints.start, 0, 1)
         if self._hints.refines:
             observations = yield hint[None, :]
