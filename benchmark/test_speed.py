@@ -11,9 +11,10 @@ import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, read_session, Trial
 from dlo_calibration.model.parameters import knot_names, ParameterSpace
-from dlo_calibration.simulation import kernels, kernels_together, rope  # noqa: F401  # compiled, if it was not
+from dlo_calibration.simulation import entries, rope
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration.simulation.kernel_cache import compile_kernels, KERNELS
 
 NODES = (12, 30, 60, 120)
 ROUNDS = 7
@@ -26,6 +27,9 @@ TOGETHER = {  # what is simulated -> free parameters
 VALUES = {'flexibility': 66.7, 'friction': 69.7}  # the truth of object 1
 HOW = ('Object 1; a settled round is one trial simulated until the DLO has come to rest. Shortest of '
        f'{ROUNDS} repetitions, in which the engines take turns in one process; its processor time.')
+
+for module in KERNELS:
+    compile_kernels(module)
 
 
 def object1():
@@ -162,8 +166,8 @@ class Watch:
 
 
 def look_for_no_contact(arguments):
-    """Change the rope of `kernels.advance` so that it checks no pair of segments for contact."""
-    contact = arguments[0].contact
+    """Change the rope of `entries.advance` so that it checks no pair of segments for contact."""
+    contact = arguments[0].state.contact
     contact.room[:] = np.inf
 
 
@@ -173,12 +177,12 @@ def test_parts(benchmark, nodes, tables, monkeypatch):
     """Measure kernels where Python calls them, and self-contact as the time saved without it."""
     trials, physical = object1()
     simulator = CompiledSimulator(nodes=nodes)
-    advance, start = kernels.advance, rope.start_distances
+    advance, start = entries.advance, rope.start_distances
     whole, kernel, distances, contact = [], [], [], []
 
     def measure(prepare=lambda arguments: None):
         watches = Watch(advance, prepare), Watch(start)
-        monkeypatch.setattr(kernels, 'advance', watches[0])
+        monkeypatch.setattr(entries, 'advance', watches[0])
         monkeypatch.setattr(rope, 'start_distances', watches[1])
         begun = time.process_time()
         steps = sum(simulator.simulate(trial, physical).steps for trial in trials)

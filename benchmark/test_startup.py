@@ -5,7 +5,6 @@
 
 from importlib.util import find_spec
 import os
-from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -22,7 +21,24 @@ COMMANDS = {
     'calibrator --help': ('dlo_calibration.ros.calibrator', '--help'),
     'calibrator, until it is ready': ('dlo_calibration.ros.calibrator',),
 }
-FIT = ('first evaluation', 'result printed', 'page and all files written')
+FIT = ('first simulation begins', 'first evaluation kept', 'result printed', 'page and all files written')
+#: executes the command, and notes when its processes get the first evaluation to simulate
+NOTING = """
+import sys, time
+from dlo_calibration.__main__ import main
+from dlo_calibration.evaluation.processes import ProcessExecutor
+
+submit, note = ProcessExecutor.submit, sys.argv.pop()
+
+def noting(*words, **more):
+    ProcessExecutor.submit = submit
+    with open(note, 'w') as file:
+        file.write(repr(time.time()))
+    return submit(*words, **more)
+
+ProcessExecutor.submit = noting
+sys.exit(main())
+"""
 READY = 'collecting trials'  # says the node
 ENVIRONMENT = {**os.environ, 'PYTHONPATH': str(HERE.parent)}
 PATIENCE = 60  # s
@@ -48,18 +64,18 @@ def finish(words, *options):
 
 def fit(folder):
     """Return the seconds after which `fit` of the sample has done what FIT lists."""
-    log, begun, times = Path(folder) / 'unfinished/evaluations.log', time.perf_counter(), []
+    log, note, begun = folder / 'unfinished/evaluations.log', folder.with_suffix('.note'), time.time()
     process = subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration', 'fit', str(SAMPLES / 'object1'), '--output', str(folder)],
+        [sys.executable, '-c', NOTING, 'fit', str(SAMPLES / 'object1'), '--output', str(folder), str(note)],
         env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     while process.poll() is None and not (log.exists() and b'evaluation-' in log.read_bytes()):
         time.sleep(0.005)
-    times.append(time.perf_counter() - begun)
+    times = [time.time()]
     process.stdout.readline()
-    times.append(time.perf_counter() - begun)
+    times.append(time.time())
     process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
-    return [*times, time.perf_counter() - begun]
+    return [one - begun for one in (float(note.read_text()), *times, time.time())]
 
 
 @pytest.fixture(scope='module')

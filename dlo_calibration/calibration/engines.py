@@ -13,33 +13,28 @@ from typing import Any, Callable, Mapping
 from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError, printable
 from dlo_calibration.evaluation.apart import SimulatorApart
-from dlo_calibration.evaluation.unmade import Unmade, UnmadeTogether
 from dlo_calibration.simulation.protocol import Simulator
 
 SimulatorFactory = Callable[[Options], Simulator]
 
 
 def _bullet(options: Options) -> Simulator:
-    if not options.scene:
-        return Unmade('bullet', _bullet_itself, options)
-    simulator = _bullet_itself(options)
-    if parent_process() is not None:  # a worker's process is one of its own already
+    from dlo_calibration.simulation.bullet import BulletSimulator
+
+    simulator = BulletSimulator(**engine_settings(options), scene=options.scene)
+    if not options.scene or parent_process() is not None:  # a worker's process is one of its own already
         return simulator
     # A scene may come from a stranger: what it does to PyBullet must not end the node or the command.
     return SimulatorApart(simulator, f'scene {options.scene}', options.answer_limit)
-
-
-def _bullet_itself(options: Options) -> Simulator:
-    from dlo_calibration.simulation.bullet import BulletSimulator
-
-    return BulletSimulator(**engine_settings(options), scene=options.scene)
 
 
 def _compiled(options: Options) -> Simulator:
     if options.scene:
         raise InputError('engine compiled', f'scene {options.scene}', 'no scene: it simulates only a table',
                          'use engine bullet or auto')
-    return UnmadeTogether('compiled', _compiled_itself, options)
+    from dlo_calibration.simulation.compiled import CompiledSimulator
+
+    return CompiledSimulator(**engine_settings(options))
 
 
 def _auto(options: Options) -> Simulator:
@@ -49,12 +44,6 @@ def _auto(options: Options) -> Simulator:
                    f'not support a scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)
-
-
-def _compiled_itself(options: Options) -> Simulator:
-    from dlo_calibration.simulation.compiled import CompiledSimulator
-
-    return CompiledSimulator(**engine_settings(options))
 
 
 def engine_settings(options: Options) -> dict[str, Any]:

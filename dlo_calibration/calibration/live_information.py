@@ -4,9 +4,8 @@
 """
 LiveInformation: how much each new trial adds, computed in the background before a calibration.
 
-It simulates in a process of its own, because PyBullet and the import of Numba hold
-the interpreter's lock, and because a process can be ended in the middle of a
-simulation when a calibration begins or the trials are deleted.
+It simulates in a process of its own, because PyBullet holds the interpreter's lock, and because a process can
+be ended in the middle of a simulation when a calibration begins or the trials are deleted.
 """
 
 from __future__ import annotations

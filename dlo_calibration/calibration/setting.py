@@ -76,7 +76,7 @@ class Setting:
 
     @property
     def _alone(self) -> Simulator:
-        """The engine; if others simulate evaluations, they simulate for it: this process loads no kernels."""
+        """The engine; if others simulate evaluations, they simulate for it, several at a time."""
         return self.simulator if self.executor is None else Executed(self.simulator, self.executor)
 
     @cached_property

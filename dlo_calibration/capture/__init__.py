@@ -17,10 +17,4 @@ Capture: photographs of a DLO on a table become trials, on a page or from the co
 OpenCV and aiohttp are loaded only where they are used.
 """
 
-from pathlib import Path
-
-from dlo_calibration.simulation.kernel_cache import settle
-
 __all__: list[str] = []
-
-settle(Path(__file__).parent)

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 import sys
+from typing import TYPE_CHECKING
 
 from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.calibrate import calibrate
@@ -32,10 +33,14 @@ from dlo_calibration.cli.source import add_source, left_out, read_source, Source
 from dlo_calibration.cli.unfinished import Unfinished
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import make_folder
+
+if TYPE_CHECKING:
+    from dlo_calibration.report.terminal import SearchBar
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,22 +87,28 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_simulator: SimulatorFactory,
          log: EvaluationLog | None) -> bool:
     """Calibrate, print the result, and write it; return whether the user stopped it."""
-    from dlo_calibration.report.terminal import SearchBar
-
     told: list[str] = []
+    bars: list[SearchBar] = []
 
     def warn_once(text: str) -> None:
         if text not in told:
             tell(f'warning: {text}')
             told.append(text)
 
+    def show(evaluation: Evaluation) -> None:
+        if not bars:  # what draws it takes as long to load as the first simulations, which go on meanwhile
+            from dlo_calibration.report.terminal import SearchBar
+
+            most = choose(source.trials, source.options).options.evaluations
+            bars.append(stack.enter_context(SearchBar(
+                most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0)))
+        bars[0].take(evaluation)
+
     with StopFlag() as stop:
-        most = choose(source.trials, source.options).options.evaluations
-        with SearchBar(most, sys.stderr, shown=not chosen.json,
-                       known=log.evaluations if log else 0) as bar:
+        with ExitStack() as stack:
             try:
                 result = calibrate(
-                    source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
+                    source.trials, source.options, on_evaluation=show, on_notice=warn_once,
                     should_stop=stop, make_simulator=make_simulator, log=log)
             except SimulationError:
                 if not stop():

@@ -29,8 +29,7 @@ class Compiling:
     """
     Has kernels compiled where this machine has not yet compiled them.
 
-    What an interrupted compilation has compiled is kept: Numba writes one kernel after the other.  The
-    kernels for several trials at once come after those of the simulation, and nobody waits for them.
+    The kernels for several trials at once come after those of the simulation, and nobody waits for them.
 
     :param module: of the kernels.
     :param then: called when they are compiled, in the thread that waited for that, e.g. to load them.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Executed: a simulator whose rollouts an executor simulates, so that this process loads no kernels."""
+"""Executed: a simulator whose rollouts an executor simulates, several at a time."""
 
 from __future__ import annotations
 

@@ -18,10 +18,11 @@ sys.path[:] = filter(None, sys.path)  # not the folder in which the user works: 
 
 with suppress(Exception):
     from dlo_calibration.simulation.kernel_cache import is_compiled, SIMULATION, TOGETHER
+    from dlo_calibration.simulation.machine_code import load
 
-    for _module in ('batch', 'unmade'):  # what the first call of each process would load
-        import_module(f'dlo_calibration.evaluation.{_module}')
-    for _kernels, _user in ((SIMULATION, 'dlo_calibration.simulation.compiled'),
-                            (TOGETHER, 'dlo_calibration.simulation.together')):
+    for _module in ('evaluation.batch', 'simulation.compiled', 'simulation.together'):
+        import_module(f'dlo_calibration.{_module}')  # what the first call of each process would load
+    for _kernels in (SIMULATION, TOGETHER):
         if is_compiled(_kernels):
-            import_module(_user)
+            load(_kernels)
+    import_module('dlo_calibration.simulation.bullet')  # last, as it is needed last

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Any, Iterable, Mapping, Sequence, TextIO
+from typing import Any, Iterable, Mapping, Sequence, TextIO, TYPE_CHECKING
 
 from rich import markup
 from rich.console import Console
@@ -20,9 +20,11 @@ from dlo_calibration.errors import shortened, told
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.quantity import measured, number
-from dlo_calibration.planning.planner import PlanProgress
 from dlo_calibration.report import sentences
 from dlo_calibration.report.rows import fit_facts, parameter_rows
+
+if TYPE_CHECKING:
+    from dlo_calibration.planning.planner import PlanProgress
 
 LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
 

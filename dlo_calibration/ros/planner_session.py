@@ -10,7 +10,6 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
-import functools
 import json
 import time
 from typing import Any, Callable, Mapping, Protocol, Union
@@ -20,7 +19,6 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
 from dlo_calibration.evaluation.compiling import Compiling
-from dlo_calibration.evaluation.unmade import UnmadeTogether
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
@@ -110,7 +108,7 @@ class PlannerSession:
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
         self._find = plan
-        self._make_simulator = functools.partial(UnmadeTogether, 'of a process', make_simulator)
+        self._make_simulator = make_simulator
         self._background: Background[Event] = Background('plan')
         self._compiling = Compiling()
         self._processes: Processes = processes or PlannerProcesses(

@@ -8,13 +8,8 @@ The engines are in `bullet` and `compiled`, the physics of both in `kernels`.  I
 used, because they take long to load.
 """
 
-from pathlib import Path
-
-from dlo_calibration.simulation.kernel_cache import settle
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
 
 __all__ = ['NodeLayout', 'Rollout', 'Settling', 'Simulator', 'Stepper', 'roll_out']
-
-settle(Path(__file__).parent)

@@ -18,7 +18,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.bullet_world import add_obstacle, Gripper, pybullet
 from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
@@ -182,7 +182,7 @@ class BulletRope:
         turned = np.empty((0, 0)) if turns is None else np.ascontiguousarray(turns, dtype=float)
         if self._grippers:
             turned = self._follow(turned)
-        if not kernels.predict_velocities(state, self._targets, turned):
+        if not entries.predict_velocities(self._rope.packed, self._targets, turned):
             raise diverged()
         sent = state.predicted - self._gravity * self.time_step  # Bullet adds it again
         client = self._client

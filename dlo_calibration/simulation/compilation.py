@@ -5,70 +5,131 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any, Callable, TypeVar
 
+import llvmlite.binding as llvm
 import numba
-from numba.extending import overload
-import numpy as np
-from numpy.typing import NDArray
+from numba.extending import intrinsic, overload
+from numba.np import arrayobj
 
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.simulation.machine_code import Compiled, encoded, fields_of, Kernel
 
-Kernel = TypeVar('Kernel', bound=Callable[..., Any])
-
-# Annotations that tell the number of axes:
-Vector = Floats
-Matrix = Floats
-Cube = Floats
-Indices = NDArray[np.int64]
-Contacts = NDArray[np.void]
-IndexRows = NDArray[np.int64]
-#: annotation -> the type that a kernel is compiled for
-TYPES: dict[str, Any] = {
-    'None': numba.void, 'bool': numba.boolean, 'int': numba.int64, 'float': numba.float64,
-    'Vector': numba.float64[::1], 'Matrix': numba.float64[:, ::1], 'Cube': numba.float64[:, :, ::1],
-    'Indices': numba.int64[::1], 'IndexRows': numba.int64[:, ::1]}
+Function = TypeVar('Function', bound=Callable[..., Any])
+types: Any = numba.types
+_DEFINED: dict[Kernel, tuple[Any, bool]] = {}  # -> the function, and whether it returns anything
 
 
-def record(record: Any) -> Any:
-    """Let kernels take a named tuple; its annotations give the types of its fields."""
-    make: Any = numba.types.NamedTuple
-    TYPES[record.__name__] = make([TYPES[word.__forward_arg__] for word in record.__annotations__.values()],
-                                  record)
-    return record
-
-
-def part(kernel: Kernel) -> Kernel:
+def part(kernel: Function) -> Function:
     """Compile a function together with the kernels that call it."""
     options: dict[str, Any] = {'_nrt': False}  # parts make no arrays: references to them need not be counted
-    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
+    compile_: Any = numba.njit(nogil=True, error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-def of_numbers(kernel: Kernel) -> Kernel:
+def of_numbers(kernel: Function) -> Function:
     """Compile a part in which no number is nan, so that the least of many is found four at once."""
     options: dict[str, Any] = {'_nrt': False, 'fastmath': {'nnan', 'nsz'}}
-    compile_: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)
+    compile_: Any = numba.njit(nogil=True, error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-def inlined(kernel: Kernel) -> Kernel:
+def inlined(kernel: Function) -> Function:
     """Compile a function as a piece of the kernels that call it, in their loops."""
     compile_: Any = numba.njit(inline='always', error_model='numpy')
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
-def one_or_each(function: Callable[..., Any]) -> Callable[[Kernel], Kernel]:
+def one_or_each(function: Callable[..., Any]) -> Callable[[Function], Function]:
     """Compile `function` as what the decorated one returns for the types: for one DLO, or for each lane."""
-    def register(choose: Kernel) -> Kernel:
+    def register(choose: Function) -> Function:
         overload(function, strict=False, inline='never', jit_options={
             'nogil': True, 'error_model': 'numpy', '_nrt': False})(choose)
         return choose
     return register
 
 
-def entry(kernel: Kernel) -> Kernel:
-    """Compile a kernel at import, or load it from the cache: a rollout never waits for the compiler."""
-    *arguments, returned = (TYPES[word] for word in kernel.__annotations__.values())
-    compile_: Any = numba.njit(returned(*arguments), cache=True, nogil=True, error_model='numpy')
-    return compile_(kernel)  # type: ignore[no-any-return]
+def entry(kernel: Kernel) -> Callable[[Function], Function]:
+    """
+    Let the decorated function be a kernel that Python calls.
+
+    :raises TypeError: if its annotations are not those of the kernel.
+    """
+    def define(function: Function) -> Function:
+        given, wanted = ([*{**one.__annotations__, 'return': 'int'}.items()] for one in (function, kernel))
+        if given != wanted:
+            raise TypeError(f'{kernel.name} is declared with {wanted}, and defined with {given}')
+        compiled = part(function)
+        _DEFINED[kernel] = compiled, function.__annotations__['return'] != 'None'
+        return compiled
+    return define
+
+
+def machine_code(module: str) -> bytes:
+    """Compile the kernels that a module defines and Python calls; return the machine code in one piece."""
+    importlib.import_module(module)
+    return encoded([_compiled(kernel, *how) for kernel, how in _DEFINED.items() if kernel.module == module])
+
+
+def _compiled(kernel: Kernel, function: Any, answers: bool) -> Compiled:
+    """Compile a function that takes the address of words, and calls another with what they tell."""
+    kinds = types.Tuple([_type(layout) for _, layout in kernel.fields])
+
+    @intrinsic
+    def arguments(_: Any, address: Any) -> Any:
+        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+            words = builder.bitcast(values[0], context.get_value_type(types.int64).as_pointer())
+            return _unpacked(context, builder, words, kinds, 0)[0]
+        return kinds(address), emit
+
+    def without_answer(address: Any) -> int:
+        function(*arguments(address))
+        return 0
+
+    def with_answer(address: Any) -> int:
+        return int(function(*arguments(address)))
+
+    call: Any = with_answer if answers else without_answer
+    compile_: Any = numba.cfunc
+    found = compile_(types.int64(types.voidptr), error_model='numpy', _nrt=False)(call)
+    _, _, (code, _) = found._library.serialize_using_object_code()
+    needed = [one.name for one in llvm.parse_assembly(found.inspect_llvm()).functions if one.is_declaration]
+    return Compiled(kernel.name, found.native_name, needed, code)
+
+
+def _type(layout: Any) -> Any:
+    """Return the type of Numba for a layout of `states`."""
+    if layout in (int, float):
+        return types.int64 if layout is int else types.float64
+    if isinstance(layout, list):
+        return types.Tuple([_type(one) for one in layout])
+    if isinstance(layout, type):
+        return types.NamedTuple([_type(one) for _, one in fields_of(layout)], layout)
+    dtype, axes = layout
+    return types.Array(numba.from_dtype(dtype), axes, 'C')
+
+
+def _unpacked(context: Any, builder: Any, words: Any, kind: Any, place: int) -> tuple[Any, int]:
+    """Return the value of a type whose words begin at a place, and the place behind them."""
+    def word(offset: int = 0) -> Any:
+        return builder.load(builder.gep(words, [context.get_constant(types.intp, place + offset)]))
+
+    if isinstance(kind, types.BaseTuple):
+        values = []
+        for one in kind:
+            value, place = _unpacked(context, builder, words, one, place)
+            values.append(value)
+        return context.make_tuple(builder, kind, values), place
+    if isinstance(kind, types.Array):
+        data = context.get_data_type(kind.dtype)
+        size = context.get_constant(types.intp, context.get_abi_sizeof(data))
+        shape, strides = [word(1 + axis) for axis in range(kind.ndim)], [size]
+        for length in shape[:0:-1]:
+            strides.insert(0, builder.mul(strides[0], length))
+        found = context.make_array(kind)(context, builder)
+        pointer = builder.inttoptr(word(), data.as_pointer())
+        arrayobj.populate_array(found, pointer, shape, strides, size, None)
+        return found._getvalue(), place + 1 + kind.ndim
+    if kind == types.float64:
+        return builder.bitcast(word(), context.get_value_type(kind)), place + 1
+    return word(), place + 1

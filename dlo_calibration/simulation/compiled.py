@@ -19,7 +19,7 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.kernel_cache import is_compiled, TOGETHER
 from dlo_calibration.simulation.nodes import NodeLayout
@@ -67,7 +67,7 @@ class CompiledRope(Rope):
         path = np.empty((0, 0, 3)) if path is None else path
         turns = np.empty((0, 0, 9)) if turns is None else np.ascontiguousarray(turns)
         targets = np.ascontiguousarray(targets)
-        if kernels.advance(self.state, targets, turns, self.level, path) < len(targets):
+        if entries.advance(self.packed, targets, turns, self.level, path) < len(targets):
             raise diverged()
 
 

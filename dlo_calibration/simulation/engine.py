@@ -11,6 +11,7 @@ from typing import Any, Mapping, Self
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.table import rest_on, resting_level
+from dlo_calibration.simulation.kernel_cache import compile_kernels, SIMULATION
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
 from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
@@ -46,7 +47,8 @@ class Engine:
         self._known: dict[int, tuple[Trial, NodeLayout, float | None, Floats]] = {}
 
     def prepare(self) -> None:
-        """Do nothing: importing the kernels has compiled them or loaded them from the cache."""
+        """See to it that the kernels are compiled."""
+        compile_kernels(SIMULATION)
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The kernel cache: where Numba keeps the machine code of the kernels, and whether it is there.
+The kernel cache: where the machine code of the kernels is kept, and whether it is there.
 
-Numba writes it beside the kernels, or into the user's cache where that folder is read-only.  What an
-installer compiled into a read-only folder is copied from there: Numba itself reads only folders that it can
-write.
+It lies beside the kernels, or in the user's cache of Numba, which compiles them, where that folder is
+read-only.
 """
 
 from __future__ import annotations
@@ -14,78 +13,64 @@ from __future__ import annotations
 from contextlib import suppress
 from functools import lru_cache
 import hashlib
-import importlib
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import platform
-import shutil
 import stat
+import subprocess
 import sys
 import tempfile
 
-CHOSEN = 'NUMBA_CACHE_DIR'  # the environment variable that tells Numba where
+from dlo_calibration.errors import SimulationError
+
+CHOSEN = 'NUMBA_CACHE_DIR'  # the environment variable that tells where, to Numba as well
 _PACKAGE = Path(os.path.abspath(__file__)).parents[1]
 #: module with kernels -> what they do, in words
 KERNELS: dict[str, str] = {
     'dlo_calibration.simulation.kernels': 'simulation',
     'dlo_calibration.simulation.kernels_together': 'simulation of several trials at once',
-    'dlo_calibration.capture.path': 'tracer'}
+    'dlo_calibration.capture.path_kernels': 'tracer'}
 SIMULATION, TOGETHER, TRACER = KERNELS
-#: name of a module with kernels -> modules whose kernels are compiled with its own
-_PARTS = {'kernels': ('kernels_carry', 'kernels_contact', 'kernels_frame', 'kernels_near', 'kernels_slip')}
-#: name of a module with kernels -> other modules that its machine code depends on
-_SOURCES = {'kernels': ('compilation', 'lanes', *_PARTS['kernels']),
-            'kernels_together': ('compilation', 'lanes', 'kernels', *_PARTS['kernels'])}
-
-
-def settle(folder: Path) -> None:
-    """See to it, before kernels in a folder of the package are imported, that Numba has a place for them."""
-    if os.environ.get(CHOSEN):
-        return
-    beside, users = folder / '__pycache__', _below(_users(), folder)
-    if _writable(beside):
-        return
-    if not _writable(users):
-        os.environ[CHOSEN] = str(_until_the_next_boot())  # processes that this one starts use it, too
-        return
-    for file in (file for file in map(_file, KERNELS) if file.parent == folder):
-        name = _mark(file)
-        if (beside / name).exists() and not (users / name).exists():
-            with suppress(OSError):  # then they are compiled once more
-                users.mkdir(parents=True, exist_ok=True)
-                for one in [*_code(file, beside), beside / name]:
-                    shutil.copyfile(one, users / one.name)
+#: modules that machine code depends on, whatever kernels it is made of
+_SOURCES = ('compilation', 'lanes', 'machine_code', 'states', 'kernels*')
 
 
 def place(module: str) -> Path:
-    """Return the folder in which Numba keeps the machine code of a module's kernels."""
-    folder = _file(module).parent
-    if chosen := os.environ.get(CHOSEN):
-        return _below(Path(chosen), folder)
-    beside = folder / '__pycache__'
-    return beside if _writable(beside) else _below(_users(), folder)
+    """Return the folder in which the machine code of a module's kernels is kept, or would be."""
+    return _place(_file(module))
 
 
 def is_compiled(module: str) -> bool:
     """Tell, without loading Numba, whether this machine has compiled the kernels of a module."""
-    return (place(module) / _mark(_file(module))).exists()
+    file = _file(module)
+    return (_place(file) / _name(file)).exists()
 
 
-def compile_kernels(module: str) -> None:
-    """Import a module, which compiles its kernels or loads them, and note that they are compiled."""
-    folder, mark = place(module), _mark(_file(module))
-    begun = (folder / mark).with_suffix('.begun')
-    with suppress(OSError):
-        if not (folder / mark).exists() and not begun.exists():
-            # Numba does not notice that another module has changed; after an interruption it may go on.
-            for old in _code(_file(module), folder):
-                old.unlink()
+def compile_kernels(module: str) -> Path:
+    """
+    Compile the kernels of a module if they are not; return the file with their machine code.
+
+    :raises SimulationError: if they cannot be compiled, kept or loaded.
+    """
+    source = _file(module)
+    folder, name = _place(source), _name(source)
+    if not (folder / name).exists():
+        from dlo_calibration.simulation.compilation import machine_code
+
+        code = machine_code(module)
+        try:
             folder.mkdir(parents=True, exist_ok=True)
-            begun.touch()
-    importlib.import_module(module)
-    with suppress(OSError):
-        (folder / mark).touch()
+            with tempfile.NamedTemporaryFile(dir=folder, prefix=f'{source.stem}.', delete=False) as file:
+                file.write(code)
+        except OSError as error:
+            raise SimulationError(
+                f'the machine code of the {KERNELS.get(module, module)} cannot be kept in {folder}: {error}; '
+                f'let {CHOSEN} name a folder that can be written') from error
+        _try(file.name)
+        os.replace(file.name, folder / name)
+    return folder / name
 
 
 def remark() -> str:
@@ -98,13 +83,42 @@ def remark() -> str:
 
 
 def _file(module: str) -> Path:
-    return _PACKAGE.joinpath(*module.split('.')[1:]).with_suffix('.py')
+    if module in KERNELS:  # without importing the packages that it is in
+        return _PACKAGE.joinpath(*module.split('.')[1:]).with_suffix('.py')
+    found = find_spec(module)
+    assert found is not None and found.origin is not None
+    return Path(found.origin)
 
 
-def _code(file: Path, folder: Path) -> list[Path]:
-    """Return the files in a folder with the machine code of a module's kernels."""
-    stems = file.stem, *_PARTS.get(file.stem, ())
-    return [one for stem in stems for one in folder.glob(f'{stem}.*.nb[ic]')]
+def _place(file: Path) -> Path:
+    folder = file.parent
+    if chosen := os.environ.get(CHOSEN):
+        return _below(Path(chosen), folder)
+    places = folder / '__pycache__', _below(_users(), folder)
+    for one in places:
+        if (one / _name(file)).exists():  # an installer may have compiled into a folder that is read-only now
+            return one
+    for one in places:
+        if _writable(one):
+            return one
+    os.environ[CHOSEN] = str(_until_the_next_boot())  # processes that this one starts use it, too
+    return _place(file)
+
+
+def _try(file: str) -> None:
+    """
+    Load machine code in another process: one that cannot load it would end.
+
+    :raises SimulationError: if it cannot be loaded.
+    """
+    program = ('import sys; from pathlib import Path; '
+               'from dlo_calibration.simulation.machine_code import loaded; loaded(Path(sys.argv[1]))')
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, '-c', program, file], capture_output=True, check=False, text=True,
+                          env=environment)
+    if done.returncode:
+        os.unlink(file)
+        raise SimulationError(f'what Numba compiled cannot be loaded: {done.stderr.strip()[-500:]}')
 
 
 def _users() -> Path:
@@ -113,7 +127,7 @@ def _users() -> Path:
 
 
 def _below(cache: Path, folder: Path) -> Path:
-    """Return the folder in a cache that Numba uses for the modules of a folder."""
+    """Return the folder in a cache that is for the modules of a folder."""
     return cache / f'{folder.name}_{hashlib.sha1(str(folder).encode(), usedforsecurity=False).hexdigest()}'
 
 
@@ -137,14 +151,15 @@ def _until_the_next_boot(make: bool = True) -> Path:
     return folder
 
 
-def _mark(file: Path) -> str:
-    """Return the name of the file that tells that a module's kernels, as they are now, were compiled here."""
-    sources = [file, *(file.with_name(f'{name}.py') for name in _SOURCES.get(file.stem, ()))]
-    return _mark_of(file.stem, tuple((one, one.stat().st_mtime_ns) for one in sources if one.exists()))
+def _name(file: Path) -> str:
+    """Return the name of the file with the machine code of a module's kernels, as they are now."""
+    folder = _PACKAGE / 'simulation'
+    sources = [file, *(one for name in _SOURCES for one in sorted(folder.glob(f'{name}.py')))]
+    return _name_of(file.stem, tuple((one, one.stat().st_mtime_ns) for one in sources))
 
 
 @lru_cache(maxsize=16)
-def _mark_of(stem: str, sources: tuple[tuple[Path, int], ...]) -> str:
+def _name_of(stem: str, sources: tuple[tuple[Path, int], ...]) -> str:
     found = hashlib.sha256()
     for source, _ in sources:
         found.update(source.read_bytes())

@@ -5,94 +5,35 @@
 Kernels: one step of a DLO, compiled by Numba.
 
 They compute the rod's internal forces and a table with friction.  The frame, hysteresis and contact of the
-DLO with itself are in `kernels_frame`, `kernels_slip` and `kernels_contact`.  Numba's cache keeps the machine
-code, so that it is compiled once per machine.  Numba notices only changes of the file that a kernel is in,
-not of the kernels that it calls: `kernel_cache` knows which other files they depend on.
+DLO with itself are in `kernels_frame`, `kernels_slip` and `kernels_contact`.  These modules are imported only
+to compile them, as loading Numba takes a second: Python calls what `entries` declares.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
-from dlo_calibration.simulation.compilation import (
+from dlo_calibration.simulation import entries
+from dlo_calibration.simulation.compilation import entry, one_or_each, part
+from dlo_calibration.simulation.kernels_contact import closest, keep_apart
+from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
+from dlo_calibration.simulation.kernels_near import is_near, movement, near_pairs
+from dlo_calibration.simulation.kernels_slip import rub
+from dlo_calibration.simulation.lanes import both, every, finite, LANES, numbers_of, some, where
+from dlo_calibration.simulation.states import (
+    BAND,
+    COUNT,
     Cube,
-    entry,
     Indices,
     Matrix,
-    one_or_each,
-    part,
-    record,
+    RodState,
+    RopeState,
+    SelfContact,
     Vector,
 )
-from dlo_calibration.simulation.kernels_contact import keep_apart, SelfContact
-from dlo_calibration.simulation.kernels_frame import add_frame, FrameState, turn_clamps
-from dlo_calibration.simulation.kernels_near import is_near, movement
-from dlo_calibration.simulation.kernels_slip import rub, SlipState
-from dlo_calibration.simulation.lanes import both, COUNT, every, finite, LANES, numbers_of, some, where
 
 HELD = 1e12  # weight of the equation that gives a held node its velocity, relative to its mass
-BAND = 7  # entries per column of the lower triangle: node i couples with i + 2, three coordinates each
-
-
-@record
-class RodState(NamedTuple):
-    """
-    All that determines the internal forces of N nodes; `rod.Rod` makes it.
-
-    :param rest_lengths: (N - 1,) [m] lengths of the segments at rest.
-    :param stiffness: (N - 1,) [N/m] of the stretching springs.
-    :param masses: (N,) [kg].
-    :param inverse_masses: (N,) [1/kg], 0 for held nodes.
-    :param bending: (3, N) [N/m] bending matrix: its diagonal and the two below.
-    :param frame: the material frame.
-    :param friction: hysteresis of bending.
-    :param held: (h,) nodes that follow given velocities.
-    :param follow: (h, 3) [m/s] velocities of the held nodes.
-    :param drag: acceleration against the velocity [1/s].
-    :param implicit: c [s^2] of the step; see `rod`.
-    :param step: time step [s].
-    :param bands: (3 N + 6, 7) workspace: columns of the lower triangle of the matrix.
-    :param right: (3 N + 6,) workspace: right side.
-    """
-
-    rest_lengths: Vector
-    stiffness: Vector
-    masses: Vector
-    inverse_masses: Vector
-    bending: Matrix
-    frame: FrameState
-    friction: SlipState
-    held: Indices
-    follow: Matrix
-    drag: float
-    implicit: float
-    step: float
-    bands: Matrix
-    right: Vector
-
-
-@record
-class RopeState(NamedTuple):
-    """
-    The state of a DLO between two steps; `rope.Rope` makes it.
-
-    :param points: (N, 3) [m].
-    :param velocities: (N, 3) [m/s].
-    :param predicted: (N, 3) [m/s] velocities after the step without contact with other bodies.
-    :param support: (N, 3) [m/s] change of the velocities by other bodies in the last step.
-    :param gravity: (3,) [m/s^2].
-    :param rod: all about the internal forces.
-    :param contact: all about contact with itself.
-    """
-
-    points: Matrix
-    velocities: Matrix
-    predicted: Matrix
-    support: Matrix
-    gravity: Vector
-    rod: RodState
-    contact: SelfContact
 
 
 @part
@@ -318,7 +259,20 @@ def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Ma
             velocities[i, c] += step * gravity[c]
 
 
-@entry
+@entry(entries.start_distances)
+def start_distances(contact: SelfContact, points: Matrix) -> None:
+    """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
+    distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
+    distances[:] = diameter
+    contact.overlaps[0] = 0
+    for k in range(near_pairs(contact, points, 1.0, 0.0)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        distances[i, j] = min(diameter, closest(points, i, j)[5])
+        contact.overlaps[0] = 1
+    contact.room[:] = -1.0
+
+
+@entry(entries.predict_velocities)
 def predict_velocities(rope: RopeState, targets: Matrix, turns: Matrix) -> bool:
     """
     Write to `rope.predicted` the velocities due to gravity, internal forces and self-contact.
@@ -338,7 +292,7 @@ def predict_velocities(rope: RopeState, targets: Matrix, turns: Matrix) -> bool:
     return True
 
 
-@entry
+@entry(entries.advance)
 def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cube) -> int:
     """
     Take k steps on a table.

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from dlo_calibration.simulation.compilation import inlined, Matrix, one_or_each, part, Vector
-from dlo_calibration.simulation.lanes import COUNT, LANES, numbers_of, some, where
+from dlo_calibration.simulation.compilation import inlined, one_or_each, part
+from dlo_calibration.simulation.lanes import LANES, numbers_of, some, where
+from dlo_calibration.simulation.states import COUNT, Matrix, Vector
 
 HAIRPIN = 0.01  # least squared cosine of half the angle between two segments: limits divisions
 

@@ -6,21 +6,9 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-import numba
-import numpy as np
-
-from dlo_calibration.simulation.compilation import (
-    Contacts,
-    IndexRows,
-    Indices,
-    Matrix,
-    part,
-    record,
-    TYPES,
-    Vector,
-)
+from dlo_calibration.simulation.compilation import part
+from dlo_calibration.simulation.states import Contacts, Matrix, SelfContact, Vector
 
 ITERATIONS = 10  # of the contact solver, as many as Bullet makes
 PUSH_OUT = 0.8  # share of a penetration that one step corrects
@@ -29,64 +17,6 @@ SUPPORTED = 0.5  # cosine between a push and the opposing support from which on 
 UNSUPPORTED = 1e-6  # m/s; a smaller change of velocity is rounding, not support
 WEDGED = 0.1  # least share of the mobility of a pair; with less it is wedged, and all its nodes yield
 TINY = 1e-12  # m or m/s; shorter vectors have no direction
-
-
-#: two segments that touch each other
-CONTACT = np.dtype([
-    ('nodes', 'i8', 4),  # ends of the first and of the second segment
-    ('weights', 'f8', 4),  # of the nodes in the relative velocity of the closest points
-    ('yielding', 'f8', 4),  # inverse masses of the nodes [1/kg]; 0 if another body supports them
-    ('normal', 'f8', 3),  # unit vector from the second to the first segment
-    ('mobility', 'f8'),  # relative velocity per impulse [1/kg]
-    ('least', 'f8'),  # least velocity along the normal [m/s]
-    ('pushed', 'f8'), ('rubbed', 'f8', 3),  # total impulses along and across the normal [N s]
-    ('impulse', 'f8', 3)], align=True)  # of the current iteration [N s]
-
-TYPES['Contacts'] = numba.from_dtype(CONTACT)[::1]
-
-
-@record
-class SelfContact(NamedTuple):
-    """
-    Contact of S segments with each other: capsules that do not pass through each other.
-
-    Spheres at the nodes would let parts of a thin DLO through, because its nodes lie further
-    apart than its diameter.  Two segments whose arc-length distance is below half the
-    circumference of the cross-section cannot touch: that is the shortest hairpin.  Pairs that
-    are nearer than a diameter at the start keep that distance until they have moved apart, so
-    that a radius that is too large does not burst the DLO open.
-
-    :param half: (S,) [m] half the lengths of the segments.
-    :param middles: (S,) [m] arc lengths of their middles.
-    :param diameter: [m].
-    :param apart: least arc length [m] between two segments that can touch.
-    :param friction: Coulomb coefficient.
-    :param distances: (S, S) [m] least distances of the pairs.
-    :param pairs: (S (S - 1) / 2, 2) segments; the first `near` of these pairs are near each other.
-    :param near: (1,) number of these pairs.
-    :param room: (3,) [m] how far neighbours may still move against each other until segments that are near
-        along the DLO can touch; how far nodes may until others can, and until `pairs` must be found anew.
-    :param contacts: (S (S - 1) / 2,) of `CONTACT`, workspace.
-    :param change: (S + 1, 3) workspace.
-    :param balls: (8, S) workspace.
-    :param overlaps: (1,) 1 if some of `distances` may be below the diameter.
-    :param next_one: how many segments further the first one is that a segment can touch.
-    """
-
-    half: Vector
-    middles: Vector
-    diameter: float
-    apart: float
-    friction: float
-    distances: Matrix
-    pairs: IndexRows
-    near: Indices
-    room: Vector
-    contacts: Contacts
-    change: Matrix
-    balls: Matrix
-    overlaps: Indices
-    next_one: int
 
 
 @part

@@ -6,22 +6,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
-from dlo_calibration.simulation.compilation import (
-    IndexRows,
-    Indices,
-    inlined,
-    Matrix,
-    one_or_each,
-    part,
-    record,
-    Vector,
-)
+from dlo_calibration.simulation.compilation import inlined, one_or_each, part
 from dlo_calibration.simulation.kernels_carry import begin_to_carry, carry_along, HAIRPIN
 from dlo_calibration.simulation.lanes import (
     cosine_and_sine,
-    COUNT,
     every,
     finite,
     LANES,
@@ -29,46 +19,12 @@ from dlo_calibration.simulation.lanes import (
     some,
     where,
 )
+from dlo_calibration.simulation.states import COUNT, FrameState, IndexRows, Matrix, Vector
 
 ROUNDED = 0.05  # rad; mean bend below which the energy of natural curvature is rounded off
 STEADY = 0.01  # rad; where the bends are smaller than this, natural curvature turns the frame slowly
 REACH = 0.2  # rad; most that the material frame turns in a step
 FIRST_TURNS = 30  # iterations for the angles at the start; later, one in each step does
-
-
-@record
-class FrameState(NamedTuple):
-    """
-    The material frame of N - 1 segments, which carries the rest shape and resists twist; see `rod`.
-
-    :param natural: (N - 2, 3) [N m] EI times natural curvature at each inner node, in two directions, and the
-        length of that vector.
-    :param twisting: (N - 2,) [N m] torque per angle between the two segments at each inner node; (0,): the
-        DLO does not twist, and turns freely as a whole.
-    :param angles: (N - 1,) [rad] from a frame that is carried along without twist; (0,): there is none.
-    :param clamped: (s, 2) segments that clamps keep from turning, in order, and which of the held nodes tells
-        how each of them turns.
-    :param clamps: (s, 7) a unit vector of the material frame in each clamp, nan: unknown; the unit
-        tangent there, nan: unknown; and how far [rad] the segment must turn now.
-    :param carried: (3, 3) unit tangent of the first segment in the last step, a unit vector across it, and
-        workspace.
-    :param begun: (1,) 1 once the angles are in equilibrium.
-    :param segments: (N - 1, 7) workspace: unit tangents, inverse lengths [1/m], and unit vectors across.
-    :param joints: (N - 2, 7) bends in two directions across, inverse cosine of half the bending angle, cosine
-        and sine of the mean angle, twisting moment [N m], and cosine of half the bending angle.
-    :param turning: (N - 1, 2) workspace.
-    """
-
-    natural: Matrix
-    twisting: Vector
-    angles: Vector
-    clamped: IndexRows
-    clamps: Matrix
-    carried: Matrix
-    begun: Indices
-    segments: Matrix
-    joints: Matrix
-    turning: Matrix
 
 
 @part

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 
-from dlo_calibration.simulation.compilation import entry, Matrix, of_numbers, part
-from dlo_calibration.simulation.kernels_contact import closest, SelfContact
+from dlo_calibration.simulation.compilation import of_numbers, part
+from dlo_calibration.simulation.kernels_contact import closest
+from dlo_calibration.simulation.states import Matrix, SelfContact
 
 SKIN = 0.0001, 0.008  # m, least and most; pairs within this gap are checked until nodes may have moved so far
 STEPS_AHEAD = 10.0  # between these, the gap is as wide as nodes move in so many steps
@@ -50,19 +51,6 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
                 count += 1
             j += 1
     return count
-
-
-@entry
-def start_distances(contact: SelfContact, points: Matrix) -> None:
-    """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
-    distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
-    distances[:] = diameter
-    contact.overlaps[0] = 0
-    for k in range(near_pairs(contact, points, 1.0, 0.0)):
-        i, j = pairs[k, 0], pairs[k, 1]
-        distances[i, j] = min(diameter, closest(points, i, j)[5])
-        contact.overlaps[0] = 1
-    contact.room[:] = -1.0
 
 
 @part

@@ -6,34 +6,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from dlo_calibration.simulation.compilation import Indices, inlined, Matrix, part, record
+from dlo_calibration.simulation.compilation import inlined, part
 from dlo_calibration.simulation.kernels_carry import HAIRPIN
 from dlo_calibration.simulation.lanes import some, where
+from dlo_calibration.simulation.states import Matrix, SlipState
 
 AHEAD = 0.6  # c of friction between strands, relative to the squared step; see `rod`
-
-
-@record
-class SlipState(NamedTuple):
-    """
-    Friction between the strands of a DLO: an elastic, perfectly plastic element at each inner node.
-
-    :param rows: (N - 2, 5) curvature from three nodes [1/m]: multiplied by the points it gives
-        t_i - t_(i-1); stiffness [N m] and the change of t_i - t_(i-1) at which the strands slip.  (0, 5):
-        there is no such friction.
-    :param kept: (N - 2, 9) t_i - t_(i-1) at which the element is free of stress; mean unit tangents in the
-        last step; strain in the last step, so far does the bend differ from what is kept.
-    :param begun: (1,) 1 once `kept` is known.
-    :param pull: (N, 6) workspace: what the equation of each node gets: diagonal and the two entries below it
-        [kg], and the impulse against the bend [N s].
-    """
-
-    rows: Matrix
-    kept: Matrix
-    begun: Indices
-    pull: Matrix
 
 
 @part

@@ -10,114 +10,34 @@ Each DLO gets the same positions, bit for bit, as by itself.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
-import numba
-
-from dlo_calibration.simulation.compilation import (
-    Cube,
-    entry,
-    IndexRows,
-    Indices,
-    Matrix,
-    part,
-    record,
-    TYPES,
-    Vector,
-)
-from dlo_calibration.simulation.kernels import let_follow, rest_on_table, rod_velocities, RodState
-from dlo_calibration.simulation.kernels_contact import keep_apart, SelfContact
-from dlo_calibration.simulation.kernels_frame import FrameState, turn_clamps
+from dlo_calibration.simulation import entries
+from dlo_calibration.simulation.compilation import entry, part
+from dlo_calibration.simulation.kernels import let_follow, rest_on_table, rod_velocities
+from dlo_calibration.simulation.kernels_contact import keep_apart
+from dlo_calibration.simulation.kernels_frame import turn_clamps
 from dlo_calibration.simulation.kernels_near import is_near, movement
-from dlo_calibration.simulation.kernels_slip import SlipState
-from dlo_calibration.simulation.lanes import COUNT, lanes_of, where
-
-GOES_ON, STABLE, DIVERGED = 0, 1, 2
-DRAG, IMPLICIT, FRICTION, LEVEL, SOLVED, LAST, COMING = 0, 1, 2, 3, 4, 5, 7  # rows of `Together.numbers`
-
-
-@record
-class Move(NamedTuple):
-    """
-    What happens to one of the DLOs until its next event.
-
-    :param targets: (k, h, 3) [m] positions of the held nodes after each step; after k steps, they stay.
-    :param turns: (k, h, 9) of `turn_clamps` in each step, or (0, 0, 0).
-    :param path: (k, N, 3) [m] where the positions of all nodes after each step are written; or (0, 0, 0).
-    :param most: steps of the move, at most.
-    :param periods: (c,) steps between two checks whether the DLO is stable, the last one after `most` steps;
-        (0,): it is not checked.
-    :param seen: (c + 1, N, 3) [m] where the nodes were at the last checks.
-    :param distance: [m] it is stable if no node is further from the first of these places.
-    :param progress: (4,) steps taken; steps until the next check; checks made; how the move ended: `GOES_ON`,
-        `STABLE` or `DIVERGED`.
-    :param held: see `RodState`, like the following; they are those of the DLO.
-    :param contact: contact of the DLO with itself.
-    """
-
-    targets: Cube
-    turns: Cube
-    path: Cube
-    most: int
-    periods: Indices
-    seen: Cube
-    distance: float
-    progress: Indices
-    held: Indices
-    follow: Matrix
-    inverse_masses: Vector
-    contact: SelfContact
-
-
-@record
-class Together(NamedTuple):
-    """
-    `COUNT` DLOs of N nodes that are simulated together; the last axis is the DLO's.
-
-    What the arrays are is said at `RopeState`, `RodState`, `FrameState` and `SlipState`.
-
-    :param numbers: (9, COUNT) drag, `implicit`, friction, height of nodes on the table [m], 1 where the step
-        could be solved, and two rows each of `movement` in the last step and the coming one.
-    :param lane: (COUNT,) 0, 1, 2, ...
-    :param gravity: (3,) is the same for all, like the following.
-    :param step: time step [s].
-    :param clamped: (s, 2).
-    :param begun: (1,) 1.
-    :param one: (3, N, 3) workspace: points, predicted velocities and support of one of them.
-    """
-
-    points: Cube
-    velocities: Cube
-    predicted: Cube
-    support: Cube
-    rest_lengths: Matrix
-    stiffness: Matrix
-    masses: Matrix
-    bending: Cube
-    bands: Cube
-    right: Matrix
-    natural: Cube
-    twisting: Matrix
-    angles: Matrix
-    clamps: Cube
-    carried: Cube
-    segments: Cube
-    joints: Cube
-    turning: Cube
-    rows: Cube
-    kept: Cube
-    pull: Cube
-    numbers: Matrix
-    lane: Indices
-    gravity: Vector
-    step: float
-    clamped: IndexRows
-    begun: Indices
-    one: Cube
-
-
-Moves = tuple[Move, ...]
-TYPES['Moves'] = numba.types.UniTuple(TYPES['Move'], COUNT)
+from dlo_calibration.simulation.lanes import lanes_of, where
+from dlo_calibration.simulation.states import (
+    COMING,
+    Cube,
+    DIVERGED,
+    DRAG,
+    FrameState,
+    FRICTION,
+    IMPLICIT,
+    LAST,
+    LEVEL,
+    Matrix,
+    Move,
+    Moves,
+    RodState,
+    SlipState,
+    SOLVED,
+    STABLE,
+    Together,
+)
 
 
 @part
@@ -201,7 +121,7 @@ def _is_stable(move: Move, points: Cube, lane: int) -> bool:
     return math.sqrt(furthest) < move.distance
 
 
-@entry
+@entry(entries.advance_together)
 def advance_together(moves: Moves, together: Together, count: int, used: int) -> int:
     """
     Take steps of several DLOs at once, each as `kernels.advance` would take it, until a move ends.

@@ -25,7 +25,7 @@ from numba.core.typeconv import Conversion
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model, type_callable
 from numba.np import arrayobj
 
-COUNT = 4  # numbers of 64 bits in a register of AVX2; other processors take two or eight at once
+from dlo_calibration.simulation.states import COUNT
 
 types: Any = numba.types
 _VECTOR = ir.VectorType(ir.DoubleType(), COUNT)

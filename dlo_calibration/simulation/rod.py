@@ -51,9 +51,7 @@ from numpy.typing import NDArray
 
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import knot_names, KNOTS, PART_NAMES
-from dlo_calibration.simulation.kernels import BAND, RodState
-from dlo_calibration.simulation.kernels_frame import FrameState
-from dlo_calibration.simulation.kernels_slip import SlipState
+from dlo_calibration.simulation.states import BAND, FrameState, RodState, SlipState
 
 _KNOT_NAMES = knot_names(KNOTS[-1])
 
@@ -132,6 +130,7 @@ class Rod:
         n = len(rest_lengths) + 1
         rest_lengths = rest_lengths * properties.length_scale
         self._rows, weights, total = _rows_and_weights(rest_lengths.tobytes())
+        self._uniform = all(part == 1 for part in properties.profile)
         masses = properties.mass * weights / total
         if features is not None:
             masses += properties.marker_mass * features
@@ -161,15 +160,16 @@ class Rod:
         if self._holds and np.array_equal(held, state.held):
             return
         self._holds = True
-        follows, rigid, cells = _cells(state.rest_lengths.tobytes(), tuple(nodes))
+        follows, rigid, cells, weights, bands = _cells(state.rest_lengths.tobytes(), tuple(nodes))
         stiffnesses = self._stiffnesses(rigid)
-        joints = np.divide(stiffnesses, cells, out=np.zeros_like(cells), where=cells > 0)
+        joints = stiffnesses * weights
         self.state = state._replace(
             held=held, follow=np.zeros((len(held), 3)),
             frame=self._frame(rigid, stiffnesses, cells, held, directions or {}),
             friction=self._friction(joints, cells),
             inverse_masses=np.where(follows, 0.0, 1 / state.masses),
-            bending=_bending_bands(self._rows, joints))
+            bending=self._properties.bending_stiffness * bands if self._uniform else _bending_bands(
+                self._rows, joints))
 
     def _frame(self, rigid: NDArray[np.bool_], stiffnesses: Floats, cells: Floats, held: NDArray[np.int64],
                directions: Mapping[int, Floats]) -> FrameState:
@@ -221,7 +221,7 @@ class Rod:
         """Return the bending stiffness at each inner node, (N - 2,) [N m^2]."""
         lengths = self.state.rest_lengths
         stiffness: Floats = np.full(len(lengths) - 1, self._properties.bending_stiffness)
-        if all(part == 1 for part in self._properties.profile):
+        if self._uniform:
             return stiffness
         profile = np.array(self._properties.profile)
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -284,19 +284,24 @@ def _rows_and_weights(lengths: bytes) -> tuple[Floats, Floats, float]:
 
 
 @lru_cache(maxsize=256)
-def _cells(lengths: bytes, held: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats]:
+def _cells(lengths: bytes, held: tuple[int, ...]
+           ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats, Floats, Floats]:
     """
     Return what depends on the rest lengths and on the held nodes.
 
     :returns: (N,) which nodes are held; (N - 1,) which segments are rigid; (N - 2,) [m] the length that
-        bends at each inner node.
+        bends at each inner node; (N - 2,) [1/m] its inverse, 0 where nothing bends; and the bending matrix
+        of a DLO whose bending stiffness is 1 N m^2, see `_bending_bands`.
     """
     rest_lengths = np.frombuffer(lengths)
     follows = np.zeros(len(rest_lengths) + 1, bool)
     follows[list(held)] = True
     rigid = follows[:-1] & follows[1:]
     bendable = np.where(rigid, 0.0, rest_lengths)
-    return follows, rigid, frozen_array((bendable[:-1] + bendable[1:]) / 2)
+    cells = (bendable[:-1] + bendable[1:]) / 2
+    weights = np.divide(1.0, cells, out=np.zeros_like(cells), where=cells > 0)
+    bands = _bending_bands(_rows_and_weights(lengths)[0], weights)
+    return follows, rigid, frozen_array(cells), frozen_array(weights), frozen_array(bands)
 
 
 def _bending_bands(rows: Floats, joints: Floats) -> Floats:

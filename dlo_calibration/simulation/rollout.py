@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.hand_steps import hand_steps
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import advanced, Rollout
 
 CHECKS = 5  # of the displacement within one `Settling.time`
 PIECE = 1000  # steps in one call of a stepper: at most some seconds, even with 1000 nodes
 MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
-MOST_KEPT_STEPS = 20_000  # of a path that is kept for the next parameter set: 2 MB
 ROUNDING = 1e-9  # s; instants that differ by less are the same
 
 
@@ -305,10 +305,11 @@ class _Course:
             if count > MOST_STEPS:
                 raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
                                       f'more than {MOST_STEPS}; divide its path into several actions')
-            poses = _poses if count <= MOST_KEPT_STEPS else _poses.__wrapped__
-            positions, turns, each = poses(hand, self._time, step, count)
+            positions, turns, each = hand_steps(hand, self._time, step, count)
             offsets = self._stepper.points[list(nodes)] - positions[0]
-            path = positions[1:, None, :] + np.einsum('kij,nj->kni', turns[1:], offsets)
+            if turns is not None:
+                offsets = np.einsum('kij,nj->kni', turns[1:], offsets)
+            path = positions[1:, None, :] + offsets
             self._grips.pop(hand.name, None)
             self._let_go(nodes)
             self._grips[hand.name] = _Grip(hand, nodes, self._steps, path, each)
@@ -361,11 +362,10 @@ class _Course:
         grips = self._grips.values()
         after = [self._steps - grip.closed for grip in grips]
         moving = max((len(grip.turns) - k for k, grip in zip(after, grips, strict=True)), default=1)
-        now = np.arange(min(max(moving, 1), count))
-        targets = [grip.path[np.minimum(now + k, len(grip.path) - 1)]
-                   for k, grip in zip(after, grips, strict=True)]
+        moving = min(max(moving, 1), count)
+        targets = [_rows(grip.path, k, moving) for k, grip in zip(after, grips, strict=True)]
         turns = None if not self._stepper.twists else np.concatenate(
-            [np.repeat(grip.turns[np.minimum(now + k, len(grip.turns) - 1), None], len(grip.nodes), axis=1)
+            [np.repeat(_rows(grip.turns, k, moving)[:, None], len(grip.nodes), axis=1)
              for k, grip in zip(after, grips, strict=True)], axis=1)
         answer = yield Steps(
             np.concatenate(targets, axis=1) if targets else np.zeros((1, 0, 3)), turns, count, path, settling)
@@ -377,22 +377,14 @@ class _Course:
         return stable
 
 
+def _rows(array: Floats, first: int, count: int) -> Floats:
+    """Return so many rows of an array; where there are no more, the last one again."""
+    found = array[first:first + count]
+    rest = count - len(found)
+    return np.concatenate([found, np.repeat(array[-1:], rest, axis=0)]) if rest else found
+
+
 def _largest_move(seen: Sequence[Floats]) -> float:
     """Return the largest distance [m] of any point, at any later time, from its first position."""
     start, *later = seen
     return math.sqrt(max(float(np.square(points - start).sum(axis=1).max()) for points in later))
-
-
-@lru_cache(maxsize=64)
-def _poses(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats, Floats]:
-    """
-    Return positions and rotations of a hand.
-
-    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 3, 3) rotations until then;
-        (count + 1, 9) rotations in each step, row by row, and at last none.
-
-    They are cached because they are the same for every parameter set.
-    """
-    positions, turns = hand.poses(start + step * np.arange(count + 1))
-    each = np.concatenate([turns[1:] @ turns[:-1].transpose(0, 2, 1), np.eye(3)[None]]).reshape(-1, 9)
-    return frozen_array(positions), frozen_array(turns @ turns[0].T), frozen_array(each)

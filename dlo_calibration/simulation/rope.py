@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.simulation.kernels import RopeState
-from dlo_calibration.simulation.kernels_contact import CONTACT, SelfContact
-from dlo_calibration.simulation.kernels_near import start_distances
+from dlo_calibration.simulation.entries import start_distances
+from dlo_calibration.simulation.machine_code import Packed
 from dlo_calibration.simulation.rod import Rod, RodProperties
+from dlo_calibration.simulation.states import CONTACT, RopeState, SelfContact
 
 
 class Rope:
@@ -42,12 +42,15 @@ class Rope:
             directions, np.diff(points, axis=0), places, properties.clamp_twist)
         points = np.array(points, dtype=float)
         contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
-        start_distances(contact, points)
+        #: its contact with itself, as kernels take it
+        self.contact: Any = Packed(contact)
+        start_distances(self.contact, points)
         #: state of the kernels, which change positions and velocities in place
         self.state = RopeState(
             points=points, velocities=np.array(velocities, dtype=float), predicted=np.zeros_like(points),
             support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
             contact=contact)
+        self._packed: Packed | None = None
 
     @property
     def points(self) -> Floats:
@@ -63,6 +66,13 @@ class Rope:
         """Let exactly these nodes follow given positions from now on."""
         self._rod.hold(nodes, {} if self.state.rod.frame.begun[0] else self._directions)
         self.state = self.state._replace(rod=self._rod.state)
+
+    @property
+    def packed(self) -> Packed:
+        """Its state, as kernels take it."""
+        if self._packed is None or self._packed.state is not self.state:
+            self._packed = Packed(self.state)
+        return self._packed
 
 
 def _in_clamps(directions: Floats, segments: Floats, places: Floats, twist: float) -> dict[int, Floats]:

@@ -18,13 +18,26 @@ import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.simulation import kernels_together
+from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.kernels import RodState, RopeState
-from dlo_calibration.simulation.lanes import COUNT
+from dlo_calibration.simulation.machine_code import Packed
 from dlo_calibration.simulation.protocol import advanced, Rollout
 from dlo_calibration.simulation.rollout import Course, PIECE, take
 from dlo_calibration.simulation.rope import diverged
+from dlo_calibration.simulation.states import (
+    COUNT,
+    DIVERGED,
+    DRAG,
+    FRICTION,
+    GOES_ON,
+    IMPLICIT,
+    LEVEL,
+    Move,
+    RodState,
+    RopeState,
+    STABLE,
+    Together,
+)
 
 
 class Lanes:
@@ -38,7 +51,7 @@ class Lanes:
             return _aligned(*array.shape, COUNT)
 
         #: the state of the ropes in the lanes
-        self.state = kernels_together.Together(
+        self.state = Together(
             points=_aligned(n, 3, COUNT), velocities=_aligned(n, 3, COUNT),
             predicted=_aligned(n, 3, COUNT), support=_aligned(n, 3, COUNT),
             rest_lengths=room(rod.rest_lengths), stiffness=room(rod.stiffness), masses=room(rod.masses),
@@ -49,6 +62,7 @@ class Lanes:
             kept=room(friction.kept), pull=room(friction.pull), numbers=_aligned(9, COUNT),
             lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
             begun=np.ones(1, np.int64), one=np.empty((3, n, 3)))
+        self._packed = Packed(self.state)
         self._ropes: list[RolloutUnderWay] = []
 
     def let_in(self, rollouts: Sequence[RolloutUnderWay]) -> None:
@@ -79,20 +93,20 @@ class Lanes:
         for name, array in {**_changing(rope.state), **_lasting(rod)}.items():
             getattr(self.state, name)[..., lane] = array
         numbers = self.state.numbers[:, lane]
-        numbers[kernels_together.DRAG], numbers[kernels_together.IMPLICIT] = rod.drag, rod.implicit
-        numbers[kernels_together.FRICTION] = rope.state.contact.friction
-        numbers[kernels_together.LEVEL] = rope.level
+        numbers[DRAG], numbers[IMPLICIT] = rod.drag, rod.implicit
+        numbers[FRICTION] = rope.state.contact.friction
+        numbers[LEVEL] = rope.level
 
     def advance(self, count: int) -> None:
         """Take steps of all ropes that are in, at most `count`, until one of their moves ends."""
-        moves = [one.move for one in self._ropes]
-        kernels_together.advance_together(
-            (*moves, *[moves[0]] * (COUNT - len(moves))), self.state, count, len(moves))
+        moves = [one.packed for one in self._ropes]
+        entries.advance_together(
+            (*moves, *[moves[0]] * (COUNT - len(moves))), self._packed, count, len(moves))
         advanced()
 
 
 def _changing(rope: RopeState) -> dict[str, Floats]:
-    """Return what steps change of a rope, by the names of `kernels_together.Together`."""
+    """Return what steps change of a rope, by the names of `Together`."""
     frame = rope.rod.frame
     return {'points': rope.points, 'velocities': rope.velocities, 'support': rope.support,
             'angles': frame.angles, 'clamps': frame.clamps, 'carried': frame.carried, 'joints': frame.joints,
@@ -128,14 +142,14 @@ class RolloutUnderWay:
     @property
     def arrived(self) -> bool:
         """Whether its move has ended."""
-        return self.left == 0 or self.move.progress[3] != kernels_together.GOES_ON
+        return self.left == 0 or self.move.progress[3] != GOES_ON
 
     def go_on(self) -> None:
         """Go on after a move."""
-        if self.move.progress[3] == kernels_together.DIVERGED:
+        if self.move.progress[3] == DIVERGED:
             self.outcome = diverged()
         else:
-            stable = bool(self.move.progress[3] == kernels_together.STABLE)
+            stable = bool(self.move.progress[3] == STABLE)
             self._take_next((int(self.move.progress[0]), stable))
 
     def _take_next(self, taken: tuple[int, bool] | None) -> None:
@@ -166,16 +180,17 @@ class RolloutUnderWay:
             rope.advance(steps.targets[:1], None if steps.path is None else steps.path[:1],
                          None if steps.turns is None else steps.turns[:1])
         until_check = periods[0] - first if len(periods) else 0
-        state, rod = rope.state, rope.state.rod
+        rod = rope.state.rod
         self.kind = rope.kind
-        self.move = kernels_together.Move(
+        self.move = Move(
             targets=np.ascontiguousarray(steps.targets),
             turns=np.empty((0, 0, 0)) if steps.turns is None else np.ascontiguousarray(steps.turns),
             path=np.empty((0, 0, 0)) if steps.path is None else steps.path, most=steps.count,
             periods=periods, seen=seen,
             distance=0.0 if steps.settling is None else steps.settling.distance,
-            progress=np.array([first, until_check, 0, kernels_together.GOES_ON]), held=rod.held,
-            follow=rod.follow, inverse_masses=rod.inverse_masses, contact=state.contact)
+            progress=np.array([first, until_check, 0, GOES_ON]), held=rod.held,
+            follow=rod.follow, inverse_masses=rod.inverse_masses, contact=rope.contact)
+        self.packed = Packed(self.move)
         return True
 
 

@@ -17,7 +17,7 @@ def test_a_second_time_it_is_all_there(command):
         assert code == 0
         assert [one['name'] for one in found['compiled']] == [
             'simulation', 'simulation of several trials at once', 'tracer']
-        assert all(list(Path(one['folder']).glob('*.nbi')) for one in found['compiled'])
+        assert all(list(Path(one['folder']).glob('*.compiled')) for one in found['compiled'])
     assert not any(one['compiled'] for one in found['compiled'])
 
 

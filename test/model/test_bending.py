@@ -8,7 +8,7 @@ import pytest
 
 from dlo_calibration.model.bending import bending_moments, natural_curvature, rest_shape
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation import kernels
+from dlo_calibration.simulation.entries import advance
 from dlo_calibration.simulation.rope import Rope
 
 STIFFNESS, FRICTION, SLIP = 2e-3, 1.5, 0.4
@@ -64,7 +64,7 @@ def test_a_free_dlo_takes_this_rest_shape():
     physical = space.physical({}, length)
     rope = Rope(places, points, np.zeros_like(points), physical, 0.004, np.zeros(3))
     nobody = np.zeros((3000, 0, 3)), np.empty((0, 0, 9))
-    assert kernels.advance(rope.state, *nobody, -1e6, np.empty((0, 0, 3))) == 3000
+    assert advance(rope.packed, *nobody, -1e6, np.empty((0, 0, 3))) == 3000
     expected = rest_shape(natural_curvature(physical, places[1:-1] / length), length)
     for far in (10, 20, 30):  # distances within the shape do not depend on where it lies
         seen, drawn = (np.linalg.norm(one[far:] - one[:len(one) - far], axis=1)

@@ -23,9 +23,10 @@ from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.prediction import simulate
 from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearser, Step
-from dlo_calibration.simulation import kernels_together  # noqa: F401  # compiled, if it was not
 from dlo_calibration.simulation.compiled import CompiledSimulator
+from dlo_calibration.simulation.kernel_cache import compile_kernels, TOGETHER
 
+compile_kernels(TOGETHER)
 DLO = MadeUpDlo()
 QUICK = Options(nodes=25, time_step=0.004)
 ONE = PlanOptions(workers=1, draws=2)

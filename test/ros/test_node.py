@@ -120,9 +120,10 @@ def test_late_listener_gets_all_that_is_latched(start_node):
         robot.node.create_subscription(TYPES.find(OUTPUT_TYPES[name]), f'/calibrator/{name}',
                                        functools.partial(late.__setitem__, name), LATCHED)
     robot.until(lambda: len(late) == 4, 'something is not latched')
+    robot.until(lambda: 'trial_1/simulated' in {one.ns for one in late['markers'].markers},
+                'the markers do not show the result')
     assert values(late['status'].status[0])['state'] == 'done'
     assert whole(late['result']) == whole(robot.heard['result'][-1])
-    assert 'trial_1/simulated' in {one.ns for one in late['markers'].markers}
     assert late['dlo_description'].data.startswith('<?xml')
 
 

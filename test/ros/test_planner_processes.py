@@ -16,7 +16,6 @@ from toy_simulator import new_toy, toy_trial, ToySimulator
 
 from dlo_calibration import DloCalibrationError, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.unmade import Unmade
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.ros.planner_processes import PlannerProcesses
 
@@ -44,7 +43,7 @@ def kept():
 
 
 def simulated_there(executor, factory=new_toy):
-    simulator = Unmade('toy', factory, Options())
+    simulator = factory(Options())
     return executor.submit(simulator.simulate, TRIAL, PHYSICAL).result(PATIENCE).chains
 
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_examples import drawing
+from stepping import rub
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
@@ -15,8 +16,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.bullet import BulletRope
 from dlo_calibration.simulation.bullet_world import pybullet
 from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.kernels_slip import rub, SlipState
 from dlo_calibration.simulation.rod import RodProperties
+from dlo_calibration.simulation.states import SlipState
 
 STIFFNESS, KEPT, SLIP = 1e-3, 2.0, 0.5
 

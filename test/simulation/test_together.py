@@ -16,9 +16,11 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation import kernels_together  # noqa: F401  # compiled, if it was not
 from dlo_calibration.simulation.compiled import CompiledSimulator
+from dlo_calibration.simulation.kernel_cache import compile_kernels, TOGETHER
 from dlo_calibration.simulation.protocol import simulate_all
+
+compile_kernels(TOGETHER)
 
 PAPERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 CABLES = (*PAPERS[:2], 'damping', 'internal_damping', 'torsion', 'bending_friction', 'bending_slip',

@@ -3,15 +3,58 @@
 
 """Single steps of the kernels, for tests."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_calibration.simulation.kernels import rod_velocities
-from dlo_calibration.simulation.kernels_contact import keep_apart
-from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
-from dlo_calibration.simulation.kernels_near import is_near, movement, near_pairs, start_distances
+from dlo_calibration.simulation.entries import start_distances
+from dlo_calibration.simulation.machine_code import defined_in
 from dlo_calibration.simulation.rod import Rod
 from dlo_calibration.simulation.rope import self_contact
+from dlo_calibration.simulation.states import (
+    FrameState,
+    IndexRows,
+    Matrix,
+    RodState,
+    SelfContact,
+    SlipState,
+    Vector,
+)
+
+PARTS = 'kernel_parts'
+
+
+@defined_in(PARTS)
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> int:
+    """Take a step without contacts; return 0 if it diverges."""
+
+
+@defined_in(PARTS)
+def turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> int:
+    """Turn clamps with their hands."""
+
+
+@defined_in(PARTS)
+def add_frame(frame: FrameState, step: float, right: Vector) -> int:
+    """Add the impulses of the material frame."""
+
+
+@defined_in(PARTS)
+def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
+    """Find pairs of segments that are near; return their number."""
+
+
+@defined_in(PARTS)
+def touch(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector, support: Matrix,
+          step: float, last: Vector) -> int:
+    """Let contacts change the velocities; `last` is what `kernels_near.movement` returned after it."""
+
+
+@defined_in(PARTS)
+def rub(friction: SlipState, points: Matrix, step: float) -> int:
+    """Let the strands rub on each other."""
+
 
 NO_TURNS = np.zeros((0, 9))
 
@@ -54,7 +97,7 @@ class Touching:
 
     def __init__(self, places, radius, friction, time_step):
         self.state = self_contact(np.diff(places), radius, friction)
-        self._step, self._last = time_step, (0.0, 0.0)
+        self._step, self._last = time_step, np.zeros(2)
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
@@ -68,8 +111,5 @@ class Touching:
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         allowed = velocities.copy()
-        coming = movement(allowed, self._step)
-        if is_near(self.state, points, self._last, coming):
-            keep_apart(self.state, points, allowed, inverse_masses, support, self._step)
-        self._last = movement(allowed, self._step)
+        touch(self.state, points, allowed, inverse_masses, support, self._step, self._last)
         return allowed
