@@ -114,8 +114,9 @@ def _try(file: str) -> None:
     program = ('import sys; from pathlib import Path; '
                'from dlo_calibration.simulation.machine_code import loaded; loaded(Path(sys.argv[1]))')
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
-    done = subprocess.run([sys.executable, '-c', program, file], capture_output=True, check=False, text=True,
-                          env=environment)
+    # -P: files in the folder in which the user works may have any name.
+    done = subprocess.run([sys.executable, '-P', '-c', program, file], capture_output=True, check=False,
+                          text=True, env=environment)
     if done.returncode:
         os.unlink(file)
         raise SimulationError(f'what Numba compiled cannot be loaded: {done.stderr.strip()[-500:]}')
