@@ -157,7 +157,8 @@ from {PACKAGE}.simulation.compiled import CompiledSimulator
 from {PACKAGE}.calibration.options import Options
 from {PACKAGE}.files.session import read_session, session_trials
 trials, _ = session_trials(read_session('msg_samples/object1'), Options())
-CompiledSimulator().simulate(trials[0], ParameterSpace().physical({{}}, 0.6))
+# With a rest shape, kernels call the functions of C's library.
+CompiledSimulator().simulate(trials[0], ParameterSpace().physical({{'natural_curvature': 60.0}}, 0.6))
 print(*sys.modules)
 """
     done = subprocess.run([sys.executable, '-c', program], cwd=FOLDER.parent, check=True,
