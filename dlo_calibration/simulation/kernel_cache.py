@@ -57,6 +57,8 @@ def compile_kernels(module: str) -> Path:
     source = _file(module)
     folder, name = _place(source), _name(source)
     if not (folder / name).exists():
+        # With Intel's library of vector functions, machine code could not be loaded without Numba.
+        os.environ.setdefault('NUMBA_DISABLE_INTEL_SVML', '1')
         from dlo_calibration.simulation.compilation import machine_code
 
         code = machine_code(module)
