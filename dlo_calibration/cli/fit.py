@@ -88,7 +88,7 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
          log: EvaluationLog | None) -> bool:
     """Calibrate, print the result, and write it; return whether the user stopped it."""
     told: list[str] = []
-    bars: list[SearchBar] = []
+    bar: SearchBar | None = None
 
     def warn_once(text: str) -> None:
         if text not in told:
@@ -96,13 +96,14 @@ def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_s
             told.append(text)
 
     def show(evaluation: Evaluation) -> None:
-        if not bars:  # what draws it takes as long to load as the first simulations, which go on meanwhile
+        nonlocal bar
+        if bar is None:  # what draws it takes as long to load as the first simulations, which go on meanwhile
             from dlo_calibration.report.terminal import SearchBar
 
             most = choose(source.trials, source.options).options.evaluations
-            bars.append(stack.enter_context(SearchBar(
-                most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0)))
-        bars[0].take(evaluation)
+            bar = stack.enter_context(SearchBar(
+                most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0))
+        bar.take(evaluation)
 
     with StopFlag() as stop:
         with ExitStack() as stack:

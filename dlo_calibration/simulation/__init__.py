@@ -4,8 +4,7 @@
 """
 Simulate a trial: the interface of engines, the nodes of the DLO, the course of a rollout.
 
-The engines are in `bullet` and `compiled`, the physics of both in `kernels`.  Import them where they are
-used, because they take long to load.
+The engines are in `bullet` and `compiled`, the physics of both in `kernels`, which they call by `entries`.
 """
 
 from dlo_calibration.simulation.nodes import NodeLayout

@@ -23,14 +23,14 @@ _DEFINED: dict[Kernel, tuple[Any, bool]] = {}  # -> the function, and whether it
 def part(kernel: Function) -> Function:
     """Compile a function together with the kernels that call it."""
     options: dict[str, Any] = {'_nrt': False}  # parts make no arrays: references to them need not be counted
-    compile_: Any = numba.njit(nogil=True, error_model='numpy', **options)
+    compile_: Any = numba.njit(error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
 def of_numbers(kernel: Function) -> Function:
     """Compile a part in which no number is nan, so that the least of many is found four at once."""
     options: dict[str, Any] = {'_nrt': False, 'fastmath': {'nnan', 'nsz'}}
-    compile_: Any = numba.njit(nogil=True, error_model='numpy', **options)
+    compile_: Any = numba.njit(error_model='numpy', **options)
     return compile_(kernel)  # type: ignore[no-any-return]
 
 
@@ -44,7 +44,7 @@ def one_or_each(function: Callable[..., Any]) -> Callable[[Function], Function]:
     """Compile `function` as what the decorated one returns for the types: for one DLO, or for each lane."""
     def register(choose: Function) -> Function:
         overload(function, strict=False, inline='never', jit_options={
-            'nogil': True, 'error_model': 'numpy', '_nrt': False})(choose)
+            'error_model': 'numpy', '_nrt': False})(choose)
         return choose
     return register
 

@@ -21,7 +21,6 @@ from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.engine import Engine
-from dlo_calibration.simulation.kernel_cache import is_compiled, TOGETHER
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Job, Rollout
 from dlo_calibration.simulation.rollout import Course, course
@@ -83,7 +82,7 @@ class CompiledSimulator(Engine):
 
         :raises InputError: if a trial grips more points than there are nodes.
         """
-        if not is_compiled(TOGETHER):  # it may be under way
+        if not entries.advance_together.ready:  # its compilation may be under way
             found = []
             for job in jobs:
                 between()

@@ -24,6 +24,7 @@ import sys
 import tempfile
 
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.writing import replacing
 
 CHOSEN = 'NUMBA_CACHE_DIR'  # the environment variable that tells where, to Numba as well
 _PACKAGE = Path(os.path.abspath(__file__)).parents[1]
@@ -64,14 +65,13 @@ def compile_kernels(module: str) -> Path:
         code = machine_code(module)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=folder, prefix=f'{source.stem}.', delete=False) as file:
-                file.write(code)
+            with replacing(folder / name) as new:
+                new.write_bytes(code)
+                _try(new)
         except OSError as error:
             raise SimulationError(
                 f'the machine code of the {KERNELS.get(module, module)} cannot be kept in {folder}: {error}; '
                 f'let {CHOSEN} name a folder that can be written') from error
-        _try(file.name)
-        os.replace(file.name, folder / name)
     return folder / name
 
 
@@ -107,7 +107,7 @@ def _place(file: Path) -> Path:
     return _place(file)
 
 
-def _try(file: str) -> None:
+def _try(file: Path) -> None:
     """
     Load machine code in another process: one that cannot load it would end.
 
@@ -117,10 +117,9 @@ def _try(file: str) -> None:
                'from dlo_calibration.simulation.machine_code import loaded; loaded(Path(sys.argv[1]))')
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
     # -P: files in the folder in which the user works may have any name.
-    done = subprocess.run([sys.executable, '-P', '-c', program, file], capture_output=True, check=False,
+    done = subprocess.run([sys.executable, '-P', '-c', program, str(file)], capture_output=True, check=False,
                           text=True, env=environment)
     if done.returncode:
-        os.unlink(file)
         raise SimulationError(f'what Numba compiled cannot be loaded: {done.stderr.strip()[-500:]}')
 
 

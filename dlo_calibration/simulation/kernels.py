@@ -16,9 +16,9 @@ from typing import Any
 
 from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.compilation import entry, one_or_each, part
-from dlo_calibration.simulation.kernels_contact import closest, keep_apart
+from dlo_calibration.simulation.kernels_contact import keep_apart
 from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
-from dlo_calibration.simulation.kernels_near import is_near, movement, near_pairs
+from dlo_calibration.simulation.kernels_near import is_near, movement
 from dlo_calibration.simulation.kernels_slip import rub
 from dlo_calibration.simulation.lanes import both, every, finite, LANES, numbers_of, some, where
 from dlo_calibration.simulation.states import (
@@ -29,7 +29,6 @@ from dlo_calibration.simulation.states import (
     Matrix,
     RodState,
     RopeState,
-    SelfContact,
     Vector,
 )
 
@@ -257,19 +256,6 @@ def _start_step(points: Matrix, velocities: Matrix, gravity: Vector, targets: Ma
     for i in range(len(points)):
         for c in range(3):
             velocities[i, c] += step * gravity[c]
-
-
-@entry(entries.start_distances)
-def start_distances(contact: SelfContact, points: Matrix) -> None:
-    """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
-    distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
-    distances[:] = diameter
-    contact.overlaps[0] = 0
-    for k in range(near_pairs(contact, points, 1.0, 0.0)):
-        i, j = pairs[k, 0], pairs[k, 1]
-        distances[i, j] = min(diameter, closest(points, i, j)[5])
-        contact.overlaps[0] = 1
-    contact.room[:] = -1.0
 
 
 @entry(entries.predict_velocities)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 
-from dlo_calibration.simulation.compilation import of_numbers, part
+from dlo_calibration.simulation import entries
+from dlo_calibration.simulation.compilation import entry, of_numbers, part
 from dlo_calibration.simulation.kernels_contact import closest
 from dlo_calibration.simulation.states import Matrix, SelfContact
 
@@ -51,6 +52,19 @@ def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: floa
                 count += 1
             j += 1
     return count
+
+
+@entry(entries.start_distances)
+def start_distances(contact: SelfContact, points: Matrix) -> None:
+    """Set the least distances of pairs at the start, (N, 3) [m] points, so that none is pushed apart."""
+    distances, diameter, pairs = contact.distances, contact.diameter, contact.pairs
+    distances[:] = diameter
+    contact.overlaps[0] = 0
+    for k in range(near_pairs(contact, points, 1.0, 0.0)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        distances[i, j] = min(diameter, closest(points, i, j)[5])
+        contact.overlaps[0] = 1
+    contact.room[:] = -1.0
 
 
 @part

@@ -26,7 +26,7 @@ from typing import Any, Callable, Iterable, NamedTuple, Sequence
 
 import numpy as np
 
-from dlo_calibration.simulation.kernel_cache import compile_kernels
+from dlo_calibration.simulation.kernel_cache import compile_kernels, is_compiled
 from dlo_calibration.simulation.states import LAYOUTS
 
 _start, _address, _octets = ctypes.c_char.from_buffer, ctypes.addressof, struct.pack
@@ -82,6 +82,11 @@ class Kernel:
         words = array('q')
         _add(words, values, self.fields)
         return self._function(words.buffer_info()[0])
+
+    @property
+    def ready(self) -> bool:
+        """Whether a call need not compile it."""
+        return self._function != self._load or is_compiled(self.module)
 
     def _load(self, address: int) -> int:
         """Load all kernels of the module, and execute this one."""
@@ -175,7 +180,7 @@ def _add_symbol(llvm: Any, name: str) -> None:
     instruction = name.startswith('llvm.')
     name = name.split('.')[1] if instruction else name
     for one in (name, 'sincos') if name in ('sin', 'cos') else (name,):  # LLVM joins the two where it can
-        if llvm.address_of_symbol(one) is not None:  # Numba is loaded, too, and has told it
+        if llvm.address_of_symbol(one) is not None:  # Numba is loaded, too: its own functions must stay
             continue
         function = getattr(_LIBRARY, 'abort' if one in _RAISING else one, None)
         if function is not None:

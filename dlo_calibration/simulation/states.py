@@ -280,7 +280,7 @@ Moves = tuple[Move, ...]  # one of each lane
 #: annotation -> how its values are given to kernels: as `int` or `float`, as an array of a type and a number
 #: of axes, or as a tuple of others
 LAYOUTS: dict[str, Any] = {
-    'bool': int, 'int': int, 'float': float, 'Vector': (np.dtype(float), 1), 'Matrix': (np.dtype(float), 2),
+    'int': int, 'float': float, 'Vector': (np.dtype(float), 1), 'Matrix': (np.dtype(float), 2),
     'Cube': (np.dtype(float), 3), 'Indices': (np.dtype(np.int64), 1), 'IndexRows': (np.dtype(np.int64), 2),
     'Vector32': (np.dtype(np.float32), 1), 'Matrix32': (np.dtype(np.float32), 2),
     'Cube32': (np.dtype(np.float32), 3), 'Bytes': (np.dtype(np.int8), 1), 'ByteRows': (np.dtype(np.int8), 2),

@@ -73,7 +73,6 @@ def test_another_state_is_refused():
 def test_kernels_and_functions_that_numba_compiled_work_in_one_process():
     """Numba's functions raise; those that kernels would call for that do not."""
     program = """
-import numpy as np
 if {first}:
     import numba
 from test_machine_code import CONTACT, POINTS, start_distances
