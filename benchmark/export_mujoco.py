@@ -54,7 +54,7 @@ from dlo_calibration import (
 from dlo_calibration.files.result import Description
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.simulation.rollout import Settling
+from dlo_calibration.simulation.script import Settling
 
 POINTS = 21
 SEGMENTS = (20, 40, 60)

@@ -230,7 +230,7 @@ class BulletRope:
             pybullet.removeBody(body, physicsClientId=self._client)
 
 
-class BulletSimulator(Engine):
+class BulletSimulator(Engine[BulletRope]):
     """
     Simulates trials in a PyBullet world of its own: a rope, perhaps a table and a scene.
 

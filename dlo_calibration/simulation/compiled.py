@@ -11,7 +11,7 @@ It is faster because no call into another library is needed for each node and st
 from __future__ import annotations
 
 from functools import partial
-from typing import Callable, Hashable, Mapping, Sequence
+from typing import Any, Callable, Hashable, Mapping, Sequence
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from dlo_calibration.model.parameters import GRAVITY
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.engine import Engine
+from dlo_calibration.simulation.machine_code import Packed
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Job, Rollout
-from dlo_calibration.simulation.rollout import Course, course
+from dlo_calibration.simulation.rollout import CHECKS, roll_out, Steps
 from dlo_calibration.simulation.rope import diverged, Rope
+from dlo_calibration.simulation.states import Move
+
+_NOTHING = np.empty((0, 0, 0))
 
 
 class CompiledRope(Rope):
@@ -40,7 +44,28 @@ class CompiledRope(Rope):
         super().__init__(places, points, velocities, physical, time_step, np.array([0.0, 0.0, -GRAVITY]),
                          features, directions)
         self.time_step = time_step
+        self._move: Packed | None = None
+        self.put_on(level)
+
+    def put_on(self, level: float | None) -> None:
+        """Set the height [m] of nodes that touch the table; None: no table."""
         self.level = -1e6 if level is None else level  # so low that nothing touches it
+
+    def packed_move(self, steps: Steps) -> Packed:
+        """Return a `Move` that takes steps of this rope, as kernels take it; it replaces the one before."""
+        rod, nothing = self.state.rod, _NOTHING
+        fields = {
+            'targets': np.ascontiguousarray(steps.targets), 'most': steps.count,
+            'turns': nothing if steps.turns is None else np.ascontiguousarray(steps.turns),
+            'path': nothing if steps.path is None else steps.path, 'periods': steps.periods(self.time_step),
+            'distance': 0.0 if steps.settling is None else steps.settling.distance, 'held': rod.held,
+            'follow': rod.follow, 'inverse_masses': rod.inverse_masses, 'contact': self.contact}
+        if self._move is None:
+            self._move = Packed(Move(**fields, seen=np.empty((CHECKS + 1, *self.state.points.shape)),
+                                     progress=np.zeros(4, np.int64)))
+        else:
+            self._move.set(**fields)
+        return self._move
 
     @property
     def kind(self) -> Hashable:
@@ -63,17 +88,28 @@ class CompiledRope(Rope):
 
         :raises SimulationError: if the rollout diverges.
         """
-        path = np.empty((0, 0, 3)) if path is None else path
-        turns = np.empty((0, 0, 9)) if turns is None else np.ascontiguousarray(turns)
+        path = _NOTHING if path is None else path
+        turns = _NOTHING if turns is None else np.ascontiguousarray(turns)
         targets = np.ascontiguousarray(targets)
         if entries.advance(self.packed, targets, turns, self.level, path) < len(targets):
             raise diverged()
 
 
-class CompiledSimulator(Engine):
+class CompiledSimulator(Engine[CompiledRope]):
     """Simulates trials on a table or in the air, about 40 times as fast as `bullet.BulletSimulator`."""
 
     name = 'compiled'
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._free: list[CompiledRope] = []  # ropes that no rollout needs any more
+
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """Simulate a trial; see `Engine.simulate`."""
+        script, rope = self._start(trial, physical)
+        rollout = roll_out(script, rope)
+        self._free.append(rope)
+        return rollout
 
     def simulate_together(self, jobs: Sequence[Job],
                           between: Callable[[], None] = lambda: None) -> list[Rollout | SimulationError]:
@@ -90,12 +126,7 @@ class CompiledSimulator(Engine):
             return found
         from dlo_calibration.simulation.together import roll_out_together
 
-        def start(trial: Trial, physical: Mapping[str, float]) -> tuple[CompiledRope, Course]:
-            layout, rope = self._start(trial, physical)
-            assert isinstance(rope, CompiledRope)
-            return rope, course(trial, layout, rope, self._settling)
-
-        return roll_out_together([partial(start, *job) for job in jobs], between)
+        return roll_out_together([partial(self._start, *job) for job in jobs], self._free, between)
 
     def _outcome(self, trial: Trial, physical: Mapping[str, float]) -> Rollout | SimulationError:
         try:
@@ -105,5 +136,19 @@ class CompiledSimulator(Engine):
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> CompiledRope:
-        return CompiledRope(layout.places, points, layout.velocities, physical, self._time_step, level,
-                            layout.features, layout.directions)
+        if not self._free:
+            return CompiledRope(layout.places, points, layout.velocities, physical, self._time_step, level,
+                                layout.features, layout.directions)
+        rope = self._free.pop()
+        rope.begin(layout.places, points, layout.velocities, physical, layout.features, layout.directions)
+        rope.put_on(level)
+        return rope
+
+    def close(self) -> None:
+        """Drop what is known of the trials, and all ropes."""
+        super().close()
+        self._free.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the ropes, too: they belong to this process."""
+        return {**super().__getstate__(), '_free': []}

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Mapping, Self
+from typing import Any, Generic, Mapping, Self, TypeVar
 
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
@@ -14,12 +14,18 @@ from dlo_calibration.observation.table import rest_on, resting_level
 from dlo_calibration.simulation.kernel_cache import compile_kernels, SIMULATION
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
-from dlo_calibration.simulation.rollout import roll_out, Settling, Stepper
+from dlo_calibration.simulation.rollout import roll_out, Stepper
+from dlo_calibration.simulation.script import Script, Settling
+from dlo_calibration.simulation.script_writer import write_script
 
 MOST_KNOWN = 1000  # trials whose nodes are kept; a plan simulates each of its trials only once
+MOST_ROWS = 200_000  # of all scripts that are kept: 100 MB if hands hold four nodes
 
 
-class Engine:
+AnyRope = TypeVar('AnyRope', bound=Stepper)
+
+
+class Engine(Generic[AnyRope]):
     """
     Simulates trials on a table or in the air.
 
@@ -45,6 +51,7 @@ class Engine:
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
         self._known: dict[int, tuple[Trial, NodeLayout, float | None, Floats]] = {}
+        self._scripts: dict[int, tuple[Trial, Script]] = {}
 
     def prepare(self) -> None:
         """See to it that the kernels are compiled."""
@@ -57,16 +64,27 @@ class Engine:
         :raises SimulationError: if the rollout diverges.
         :raises InputError: if the trial grips more points than there are nodes.
         """
-        layout, rope = self._start(trial, physical)
-        return roll_out(trial, layout, rope, self._settling)
+        return roll_out(*self._start(trial, physical))
 
-    def _start(self, trial: Trial, physical: Mapping[str, float]) -> tuple[NodeLayout, Stepper]:
-        """Return the nodes of a trial, and a rope at the start of it."""
+    def _start(self, trial: Trial, physical: Mapping[str, float]) -> tuple[Script, AnyRope]:
+        """Return the script of a trial, and a rope at the start of it."""
         layout, level, points = self._layout(trial)
         if self._table_height is not None and level is None:
             level = self._table_height + physical['self_collision']
             points = rest_on(points, level)
-        return layout, self._rope(layout, points, physical, level)
+        return self._script(trial, layout), self._rope(layout, points, physical, level)
+
+    def _script(self, trial: Trial, layout: NodeLayout) -> Script:
+        if id(trial) not in self._scripts or self._scripts[id(trial)][0] is not trial:
+            script = write_script(trial, layout, self._time_step, self._settling)
+            self._scripts.pop(id(trial), None)
+            left = MOST_ROWS - script.rows
+            while self._scripts and sum(one.rows for _, one in self._scripts.values()) > left:
+                self._scripts.pop(next(iter(self._scripts)))
+            if left < 0:
+                return script
+            self._scripts[id(trial)] = trial, script
+        return self._scripts[id(trial)][1]
 
     def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None, Floats]:
         """
@@ -84,7 +102,7 @@ class Engine:
         return self._known[id(trial)][1:]
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
-              level: float | None) -> Stepper:
+              level: float | None) -> AnyRope:
         """
         Return a rope at the start of a trial.
 
@@ -102,7 +120,8 @@ class Engine:
     def close(self) -> None:
         """Drop what is known of the trials."""
         self._known.clear()
+        self._scripts.clear()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what belongs to this process."""
-        return {**self.__dict__, '_known': {}}
+        return {**self.__dict__, '_known': {}, '_scripts': {}}

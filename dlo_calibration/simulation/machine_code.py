@@ -22,7 +22,7 @@ import json
 from pathlib import Path
 import struct
 import threading
-from typing import Any, Callable, Iterable, NamedTuple, Sequence
+from typing import Any, Callable, cast, Iterable, NamedTuple, Sequence
 
 import numpy as np
 
@@ -50,9 +50,27 @@ class Packed:
     __slots__ = ('state', 'words')
 
     def __init__(self, state: tuple[Any, ...]) -> None:
-        self.state = state
+        self.state: Any = state
         self.words = array('q')
         _add(self.words, state, fields_of(type(state)))
+
+    def set(self, **values: Any) -> None:
+        """
+        Give fields of the state other values; those that are nested may be `Packed`.
+
+        :raises TypeError: if an array is not what the state's annotations tell.
+        """
+        state, kind = self.state, cast(type, type(self.state))
+        # The fields of what is packed may have changed.
+        changed = {name: value for name, value in values.items()
+                   if getattr(state, name) is not value or type(value) is Packed}
+        for name, value in changed.items():
+            layout, start, end = _places(kind)[name]
+            words = array('q')
+            _add(words, (value,), ((name, layout),))
+            self.words[start:end] = words
+        if changed:
+            self.state = state._replace(**changed)
 
 
 class Kernel:
@@ -211,6 +229,26 @@ def _add(words: array[int], values: Iterable[Any], fields: Iterable[tuple[str, A
             _add(words, value, fields_of(layout))
         else:
             raise TypeError(f'{name} is of {kind.__name__}; a kernel takes {layout}')
+
+
+@cache
+def _places(state: type) -> dict[str, tuple[Any, int, int]]:
+    """Return layouts of the fields of a state, and where their words begin and end, by name."""
+    found, start = {}, 0
+    for name, layout in fields_of(state):
+        end = start + _size(layout)
+        found[name] = layout, start, end
+        start = end
+    return found
+
+
+def _size(layout: Any) -> int:
+    """Return the number of words of a value."""
+    if isinstance(layout, list):
+        return sum(map(_size, layout))
+    if layout in (int, float):
+        return 1
+    return 1 + layout[1] if isinstance(layout, tuple) else sum(_size(one) for _, one in fields_of(layout))
 
 
 @cache

@@ -128,21 +128,31 @@ class Rod:
     def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
                  features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
-        rest_lengths = rest_lengths * properties.length_scale
-        self._rows, weights, total = _rows_and_weights(rest_lengths.tobytes())
-        self._uniform = all(part == 1 for part in properties.profile)
-        masses = properties.mass * weights / total
-        if features is not None:
-            masses += properties.marker_mass * features
-        self._properties, self._holds = properties, False
         self.state = RodState(
-            rest_lengths=rest_lengths, stiffness=properties.stretching_stiffness / rest_lengths,
-            masses=masses, inverse_masses=1 / masses, bending=np.zeros((3, n)), frame=_no_frame(),
-            friction=_no_friction(), held=np.zeros(0, np.int64), follow=np.zeros((0, 3)),
-            drag=float(properties.drag),
-            implicit=float(time_step * max(properties.internal_damping, 0.6 * time_step)),
+            rest_lengths=np.empty(n - 1), stiffness=np.empty(n - 1), masses=np.empty(n),
+            inverse_masses=np.empty(n), bending=np.empty((3, n)), frame=_no_frame(), friction=_no_friction(),
+            held=np.zeros(0, np.int64), follow=np.zeros((0, 3)), drag=0.0, implicit=0.0,
             step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
             right=np.empty(3 * n + BAND - 1))
+        self.begin(rest_lengths, properties, features)
+
+    def begin(self, rest_lengths: Floats, properties: RodProperties, features: Floats | None = None) -> None:
+        """Become another chain of as many nodes; see the constructor."""
+        state = self.state
+        np.multiply(rest_lengths, properties.length_scale, out=state.rest_lengths)
+        np.divide(properties.stretching_stiffness, state.rest_lengths, out=state.stiffness)
+        self._lengths = state.rest_lengths.tobytes()
+        self._rows, weights, total = _rows_and_weights(self._lengths)
+        np.multiply(properties.mass, weights, out=state.masses)
+        np.divide(state.masses, total, out=state.masses)
+        if features is not None and properties.marker_mass:
+            np.add(state.masses, properties.marker_mass * features, out=state.masses)
+        self._uniform = all(part == 1 for part in properties.profile)
+        self._properties = properties
+        self._held: tuple[int, ...] | None = None
+        self.state = state._replace(
+            frame=_no_frame(), friction=_no_friction(), drag=float(properties.drag),
+            implicit=float(state.step * max(properties.internal_damping, 0.6 * state.step)))
         self.hold(())
 
     def hold(self, nodes: Sequence[int], directions: Mapping[int, Floats] | None = None) -> None:
@@ -156,20 +166,32 @@ class Rod:
             material frame.  Other clamps hold the DLO as they find it.
         """
         state = self.state
-        held = np.array(nodes, np.int64)
-        if self._holds and np.array_equal(held, state.held):
+        if tuple(nodes) == self._held:
             return
-        self._holds = True
-        follows, rigid, cells, weights, bands = _cells(state.rest_lengths.tobytes(), tuple(nodes))
-        stiffnesses = self._stiffnesses(rigid)
-        joints = stiffnesses * weights
+        self._held = tuple(nodes)
+        held = np.array(self._held, np.int64)
+        follows, rigid, cells, weights, bands = _cells(self._lengths, self._held)
+        np.divide(1.0, state.masses, out=state.inverse_masses)
+        state.inverse_masses[follows] = 0.0
+        frame, friction = state.frame, state.friction
+        if self._uniform:
+            np.multiply(self._properties.bending_stiffness, bands, out=state.bending)
+        if not self._uniform or self._framed or self._properties.bending_friction > 0:
+            stiffnesses = self._stiffnesses(rigid)
+            joints = stiffnesses * weights
+            frame = self._frame(rigid, stiffnesses, cells, held, directions or {})
+            friction = self._friction(joints, cells)
+            if not self._uniform:
+                state.bending[...] = _bending_bands(self._rows, joints)
         self.state = state._replace(
-            held=held, follow=np.zeros((len(held), 3)),
-            frame=self._frame(rigid, stiffnesses, cells, held, directions or {}),
-            friction=self._friction(joints, cells),
-            inverse_masses=np.where(follows, 0.0, 1 / state.masses),
-            bending=self._properties.bending_stiffness * bands if self._uniform else _bending_bands(
-                self._rows, joints))
+            held=held, follow=np.zeros((len(held), 3)), frame=frame, friction=friction)
+
+    @property
+    def _framed(self) -> bool:
+        """Whether there may be a material frame."""
+        properties = self._properties
+        return properties.torsion > 0 or bool(properties.natural_curvature) or any(
+            map(any, properties.rest_curvature))
 
     def _frame(self, rigid: NDArray[np.bool_], stiffnesses: Floats, cells: Floats, held: NDArray[np.int64],
                directions: Mapping[int, Floats]) -> FrameState:

@@ -35,22 +35,40 @@ class Rope:
     def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
                  time_step: float, gravity: Floats, features: Floats | None = None,
                  directions: Floats | None = None) -> None:
-        properties = RodProperties.of(physical)
-        self._rod = Rod(np.diff(places), properties, time_step, features)
-        # A rest shape of unknown direction turns to where the DLO is bent at the start.
-        self._directions = {} if directions is None or not properties.rest_curvature else _in_clamps(
-            directions, np.diff(points, axis=0), places, properties.clamp_twist)
-        points = np.array(points, dtype=float)
-        contact = self_contact(self._rod.state.rest_lengths, physical['self_collision'], physical['friction'])
+        properties, lengths = RodProperties.of(physical), np.diff(places)
+        self._rod = Rod(lengths, properties, time_step, features)
+        contact = self_contact(self._rod.state.rest_lengths, 0.0, 0.0)
         #: its contact with itself, as kernels take it
         self.contact: Any = Packed(contact)
-        start_distances(self.contact, points)
+        points = np.array(points, dtype=float)
         #: state of the kernels, which change positions and velocities in place
         self.state = RopeState(
             points=points, velocities=np.array(velocities, dtype=float), predicted=np.zeros_like(points),
             support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
             contact=contact)
         self._packed: Packed | None = None
+        self._begin(places, properties, physical, directions)
+
+    def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+              features: Floats | None = None, directions: Floats | None = None) -> None:
+        """Become another DLO of as many nodes at the start of a trial; see the constructor."""
+        properties = RodProperties.of(physical)
+        self._rod.begin(np.diff(places), properties, features)
+        state = self.state
+        state.points[...], state.velocities[...] = points, velocities
+        state.predicted[...], state.support[...] = 0.0, 0.0
+        self._begin(places, properties, physical, directions)
+
+    def _begin(self, places: Floats, properties: RodProperties, physical: Mapping[str, float],
+               directions: Floats | None) -> None:
+        # A rest shape of unknown direction turns to where the DLO is bent at the start.
+        self._directions = {} if directions is None or not properties.rest_curvature else _in_clamps(
+            directions, np.diff(self.state.points, axis=0), places, properties.clamp_twist)
+        half, middles, widest = _widest_gaps(self._rod.state.rest_lengths.tobytes())
+        self.contact.set(half=half, middles=middles, **_sizes(half, widest, physical['self_collision']),
+                         friction=float(physical['friction']))
+        start_distances(self.contact, self.state.points)
+        self.state = self.state._replace(rod=self._rod.state, contact=self.contact.state)
 
     @property
     def points(self) -> Floats:
@@ -104,15 +122,21 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> SelfCo
     """
     half, middles, widest = _widest_gaps(rest_lengths.tobytes())
     segments = len(half)
-    count, apart = segments * (segments - 1) // 2, max(np.pi * radius, float(half.max()))
-    beyond = np.flatnonzero(widest > apart)
+    count = segments * (segments - 1) // 2
     return SelfContact(
-        half=half, middles=middles, diameter=2.0 * radius, apart=apart, friction=float(friction),
+        half=half, middles=middles, **_sizes(half, widest, radius), friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
         near=np.zeros(1, np.int64), room=np.full(3, -1.0),
         contacts=np.empty(count, CONTACT),
         change=np.empty((segments + 1, 3)), balls=np.empty((8, segments)),
-        overlaps=np.zeros(1, np.int64), next_one=int(beyond[0]) if len(beyond) else segments)
+        overlaps=np.zeros(1, np.int64))
+
+
+def _sizes(half: Floats, widest: Floats, radius: float) -> dict[str, Any]:
+    """Return what of a `SelfContact` depends on the radius [m]; see `_widest_gaps`."""
+    apart = max(np.pi * radius, float(half.max()))
+    beyond = np.flatnonzero(widest > apart).tolist()
+    return {'diameter': 2.0 * radius, 'apart': apart, 'next_one': beyond[0] if beyond else len(half)}
 
 
 @lru_cache(maxsize=256)

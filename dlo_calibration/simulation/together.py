@@ -22,8 +22,9 @@ from dlo_calibration.simulation import entries
 from dlo_calibration.simulation.compiled import CompiledRope
 from dlo_calibration.simulation.machine_code import Packed
 from dlo_calibration.simulation.protocol import advanced, Rollout
-from dlo_calibration.simulation.rollout import Course, PIECE, take
+from dlo_calibration.simulation.rollout import course, PIECE, take
 from dlo_calibration.simulation.rope import diverged
+from dlo_calibration.simulation.script import Script
 from dlo_calibration.simulation.states import (
     COUNT,
     DIVERGED,
@@ -32,7 +33,6 @@ from dlo_calibration.simulation.states import (
     GOES_ON,
     IMPLICIT,
     LEVEL,
-    Move,
     RodState,
     RopeState,
     STABLE,
@@ -63,7 +63,13 @@ class Lanes:
             lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
             begun=np.ones(1, np.int64), one=np.empty((3, n, 3)))
         self._packed = Packed(self.state)
+        self._changing, self._lasting = self._used(_CHANGING), self._used(_LASTING)
         self._ropes: list[RolloutUnderWay] = []
+
+    def _used(self, names: Sequence[str]) -> list[tuple[int, Floats]]:
+        """Return the arrays that ropes of this kind have, and their places among `names`."""
+        arrays = [(place, getattr(self.state, name)) for place, name in enumerate(names)]
+        return [(place, array) for place, array in arrays if array.size]
 
     def let_in(self, rollouts: Sequence[RolloutUnderWay]) -> None:
         """Give these, at most `COUNT`, and no others, a lane each."""
@@ -83,15 +89,16 @@ class Lanes:
 
     def let_out(self, one: RolloutUnderWay) -> None:
         """Give a rope its state back."""
-        lane = self._ropes.index(one)
-        for name, array in _changing(one.rope.state).items():
-            array[...] = getattr(self.state, name)[..., lane]
+        lane, arrays = self._ropes.index(one), _changing(one.rope.state)
+        for place, lanes in self._changing:
+            arrays[place][...] = lanes[..., lane]
         one.inside = False
 
     def _take_in(self, rope: CompiledRope, lane: int) -> None:
         rod = rope.state.rod
-        for name, array in {**_changing(rope.state), **_lasting(rod)}.items():
-            getattr(self.state, name)[..., lane] = array
+        for used, arrays in (self._changing, _changing(rope.state)), (self._lasting, _lasting(rod)):
+            for place, lanes in used:
+                lanes[..., lane] = arrays[place]
         numbers = self.state.numbers[:, lane]
         numbers[DRAG], numbers[IMPLICIT] = rod.drag, rod.implicit
         numbers[FRICTION] = rope.state.contact.friction
@@ -99,36 +106,39 @@ class Lanes:
 
     def advance(self, count: int) -> None:
         """Take steps of all ropes that are in, at most `count`, until one of their moves ends."""
-        moves = [one.packed for one in self._ropes]
+        moves = [one.move for one in self._ropes]
         entries.advance_together(
             (*moves, *[moves[0]] * (COUNT - len(moves))), self._packed, count, len(moves))
         advanced()
 
 
-def _changing(rope: RopeState) -> dict[str, Floats]:
-    """Return what steps change of a rope, by the names of `Together`."""
+# What steps change of a rope, and what they do not, by the names of `Together`:
+_CHANGING = ('points', 'velocities', 'support', 'angles', 'clamps', 'carried', 'joints', 'kept')
+_LASTING = ('rest_lengths', 'stiffness', 'masses', 'bending', 'natural', 'twisting', 'rows')
+
+
+def _changing(rope: RopeState) -> tuple[Floats, ...]:
     frame = rope.rod.frame
-    return {'points': rope.points, 'velocities': rope.velocities, 'support': rope.support,
-            'angles': frame.angles, 'clamps': frame.clamps, 'carried': frame.carried, 'joints': frame.joints,
-            'kept': rope.rod.friction.kept}
+    return (rope.points, rope.velocities, rope.support, frame.angles, frame.clamps, frame.carried,
+            frame.joints, rope.rod.friction.kept)
 
 
-def _lasting(rod: RodState) -> dict[str, Floats]:
-    """Return what steps do not change of a rod, by the same names."""
-    return {'rest_lengths': rod.rest_lengths, 'stiffness': rod.stiffness, 'masses': rod.masses,
-            'bending': rod.bending, 'natural': rod.frame.natural, 'twisting': rod.frame.twisting,
-            'rows': rod.friction.rows}
+def _lasting(rod: RodState) -> tuple[Floats, ...]:
+    return (rod.rest_lengths, rod.stiffness, rod.masses, rod.bending, rod.frame.natural, rod.frame.twisting,
+            rod.friction.rows)
 
 
 class RolloutUnderWay:
     """
-    A rollout that is under way: a rope, and the course of its trial.
+    A rollout that is under way.
 
     :param number: its place among the rollouts that were asked for.
+    :param script: of its trial.
+    :param rope: at the start of the trial.
     """
 
-    def __init__(self, number: int, rope: CompiledRope, course: Course) -> None:
-        self.number, self.rope, self._course = number, rope, course
+    def __init__(self, number: int, script: Script, rope: CompiledRope) -> None:
+        self.number, self.rope, self._course = number, rope, course(script, rope)
         self.inside = False  # whether its state is in a lane
         self.kind: Hashable = None
         self.outcome: Rollout | SimulationError | None = None
@@ -137,20 +147,20 @@ class RolloutUnderWay:
     @property
     def left(self) -> int:
         """The steps until its move ends, at most."""
-        return self._steps.count - int(self.move.progress[0])
+        return self._steps.count - int(self._progress[0])
 
     @property
     def arrived(self) -> bool:
         """Whether its move has ended."""
-        return self.left == 0 or self.move.progress[3] != GOES_ON
+        return self.left == 0 or bool(self._progress[3] != GOES_ON)
 
     def go_on(self) -> None:
         """Go on after a move."""
-        if self.move.progress[3] == DIVERGED:
+        taken, _, _, ending = self._progress.tolist()
+        if ending == DIVERGED:
             self.outcome = diverged()
         else:
-            stable = bool(self.move.progress[3] == STABLE)
-            self._take_next((int(self.move.progress[0]), stable))
+            self._take_next((taken, ending == STABLE))
 
     def _take_next(self, taken: tuple[int, bool] | None) -> None:
         """Find the next steps that can be taken together with others; take those that cannot."""
@@ -172,34 +182,25 @@ class RolloutUnderWay:
         first = 0 if rope.has_begun else 1
         if steps.count <= first or len(periods) and periods[0] <= first:
             return False
-        seen = np.empty((0, 0, 0))
-        if len(periods):
-            seen = np.empty((len(periods) + 1, *rope.state.points.shape))
-            seen[0] = rope.state.points
+        self.move = rope.packed_move(steps)
+        self.move.state.seen[0] = rope.state.points
         if first:
             rope.advance(steps.targets[:1], None if steps.path is None else steps.path[:1],
                          None if steps.turns is None else steps.turns[:1])
         until_check = periods[0] - first if len(periods) else 0
-        rod = rope.state.rod
+        self._progress = self.move.state.progress
+        self._progress[:] = first, until_check, 0, GOES_ON
         self.kind = rope.kind
-        self.move = Move(
-            targets=np.ascontiguousarray(steps.targets),
-            turns=np.empty((0, 0, 0)) if steps.turns is None else np.ascontiguousarray(steps.turns),
-            path=np.empty((0, 0, 0)) if steps.path is None else steps.path, most=steps.count,
-            periods=periods, seen=seen,
-            distance=0.0 if steps.settling is None else steps.settling.distance,
-            progress=np.array([first, until_check, 0, GOES_ON]), held=rod.held,
-            follow=rod.follow, inverse_masses=rod.inverse_masses, contact=rope.contact)
-        self.packed = Packed(self.move)
         return True
 
 
-def roll_out_together(starts: Iterable[Callable[[], tuple[CompiledRope, Course]]],
+def roll_out_together(starts: Iterable[Callable[[], tuple[Script, CompiledRope]]], free: list[CompiledRope],
                       between: Callable[[], None]) -> list[Rollout | SimulationError]:
     """
     Simulate trials together.
 
-    :param starts: each returns a rope at the start of a trial, and the course of the trial.
+    :param starts: each returns the script of a trial, and a rope at the start of it.
+    :param free: to it the ropes are added whose rollouts have ended.
     :param between: is called again and again; what it raises ends the simulation.
     :returns: the rollouts, or why they failed, in order.
     """
@@ -212,10 +213,14 @@ def roll_out_together(starts: Iterable[Callable[[], tuple[CompiledRope, Course]]
         between()
         while waiting and len(rollouts) < 2 * COUNT:
             number, start = waiting.popleft()
-            rollouts.append(RolloutUnderWay(number, *start()))
+            try:
+                rollouts.append(RolloutUnderWay(number, *start()))
+            except SimulationError as error:
+                found[number] = error
         for one in [one for one in rollouts if one.outcome is not None]:
             found[one.number] = one.outcome
             rollouts.remove(one)
+            free.append(one.rope)
         if not rollouts:
             continue
         counts = Counter(one.kind for one in rollouts)

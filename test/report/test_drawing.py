@@ -20,7 +20,9 @@ from dlo_calibration.report.drawing import Drawn, hand_colours, session_picture,
 from dlo_calibration.report.figure import blank_figure, SIMULATED
 from dlo_calibration.simulation.motion import densely, MOST_FRAMES, simulated_motion
 from dlo_calibration.simulation.protocol import Rollout
-from dlo_calibration.simulation.rollout import roll_out, Settling
+from dlo_calibration.simulation.rollout import roll_out
+from dlo_calibration.simulation.script import Settling
+from dlo_calibration.simulation.script_writer import write_script
 
 
 def chains_of(trial, shift=0.0):
@@ -222,7 +224,8 @@ def test_instants_between_change_nothing_of_the_course(held_by):
     for one in (trial, densely(trial)):
         layout = NodeLayout.of(one, 11)
         stepper = Held(layout.points)
-        courses.append((roll_out(one, layout, stepper, Settling()), stepper.course))
+        courses.append((roll_out(
+            write_script(one, layout, stepper.time_step, Settling()), stepper), stepper.course))
     (plain, before), (dense, after) = courses
     assert np.allclose(plain.chains[-1], dense.chains[[g.stable for g in densely(trial).goals].index(True)])
     assert bool(before[-1][0]) == bool(after[-1][0]) == bool(held_by)

@@ -15,6 +15,7 @@ from dlo_calibration.simulation.entries import start_distances
 from dlo_calibration.simulation.machine_code import Packed
 from dlo_calibration.simulation.rod import _no_friction
 from dlo_calibration.simulation.rope import self_contact
+from dlo_calibration.simulation.states import Move
 
 CONTACT = self_contact(np.full(10, 0.02), 0.004, 0.5)
 POINTS = np.stack([np.linspace(0, 0.2, 11), np.zeros(11), np.zeros(11)], axis=1)
@@ -53,6 +54,26 @@ def test_a_state_that_was_packed_before_gives_the_same():
         start_distances(given, overlapping)
         found.append(CONTACT.distances.copy())
     assert np.array_equal(*found) and 0 < found[0].min() < CONTACT.diameter
+
+
+def test_fields_of_a_packed_state_can_be_set():
+    wider = CONTACT._replace(diameter=0.1, next_one=3, room=np.zeros(3))
+    contact = Packed(CONTACT)
+    contact.set(diameter=0.1, next_one=3, room=wider.room)
+    assert contact.words == Packed(wider).words
+    assert contact.state.diameter == 0.1
+    with pytest.raises(TypeError, match='room is an array of int64'):
+        contact.set(room=np.zeros(3, int))
+    assert contact.words == Packed(wider).words
+
+
+def test_a_packed_state_within_another_can_be_set():
+    contact, nothing, cube = Packed(CONTACT), np.zeros((0, 3)), np.zeros((0, 0, 0))
+    move = Packed(Move(cube, cube, cube, 3, np.zeros(0, int), cube, 0.0, np.zeros(4, int), np.zeros(0, int),
+                       nothing, np.ones(11), contact))
+    contact.set(diameter=0.1)
+    move.set(contact=contact)
+    assert move.words == Packed(move.state._replace(contact=contact.state)).words
 
 
 def test_a_kernel_must_be_defined_as_it_is_declared():

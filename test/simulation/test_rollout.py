@@ -11,7 +11,9 @@ from random_examples import drawing
 
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
 from dlo_calibration.simulation.nodes import NodeLayout
-from dlo_calibration.simulation.rollout import roll_out, Settling
+from dlo_calibration.simulation.rollout import roll_out
+from dlo_calibration.simulation.script import Settling
+from dlo_calibration.simulation.script_writer import write_script
 
 STEP = 0.01
 POINTS = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
@@ -54,7 +56,8 @@ def rolled(hands, goals, until=np.inf, settling=None, nodes=11):
     actions = [Action(hand if isinstance(hand, tuple) else (hand,)) for hand in hands]
     trial = Trial('t', CHAIN, actions, goals)
     layout = NodeLayout.of(trial, nodes)
-    return roll_out(trial, layout, Sinking(layout.points, until), settling or Settling())
+    script = write_script(trial, layout, STEP, settling or Settling())
+    return roll_out(script, Sinking(layout.points, until))
 
 
 def timed(time, held_by=()):

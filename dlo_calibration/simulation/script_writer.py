@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+write_script(): finds out what happens in a trial, step by step, before it is simulated.
+
+Hands close, move and open.  Timed goals are compared at their time; for a goal that
+is a stable configuration, the simulation continues until the DLO has come to rest.
+Time in which the DLO stays at rest is skipped.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+import math
+from typing import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.action import Hand
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.hand_steps import hand_steps
+from dlo_calibration.simulation.nodes import NodeLayout
+from dlo_calibration.simulation.script import Advance, Close, Event, Held, Hold, Script, See, Settling, Trace
+
+MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
+MOST_TRACED = 5000  # steps that are traced at once: all of them are in memory
+ROUNDING = 1e-9  # s; instants that differ by less are the same
+
+
+def write_script(trial: Trial, layout: NodeLayout, time_step: float, settling: Settling) -> Script:
+    """
+    Write the script of a trial.
+
+    :raises SimulationError: if a hand moves for more than `MOST_STEPS`.
+    """
+    writer = _Writer(trial, layout, time_step, settling)
+    writer.write()
+    return Script(tuple(writer.events), writer.places, writer.rows, layout.observe, settling, time_step)
+
+
+@dataclass
+class _Grip:
+    hand: Hand
+    nodes: tuple[int, ...]
+    rows: NDArray[np.int64]
+    closed: int  # number of steps when it closed
+    positions: Floats  # (k, 3) [m] of the hand after each later step, until it rests
+    rotations: Floats | None  # (k, 3, 3) since it closed
+    turns: Floats  # (k + 1, 9) in each of these steps, and none
+
+
+class _Writer:
+    def __init__(self, trial: Trial, layout: NodeLayout, time_step: float, settling: Settling) -> None:
+        self.events: list[Event] = []
+        self.places, self.rows = 0, 0
+        self._trial = trial
+        self._layout = layout
+        self._step = time_step
+        self._settling = settling
+        self._time = 0.0  # [s] of the trial
+        self._steps = 0
+        self._last = 0.0  # time [s] of the points that are remembered
+        self._goal = 0  # index of the current goal
+        self._timed = [goal.time for goal in trial.goals if not goal.stable]  # [s], increasing
+        self._grips: dict[str, _Grip] = {}
+        self._waiting = list(trial.hands)
+
+    def write(self) -> None:
+        """Go up to each goal in turn."""
+        seen = 0  # goals that have been
+        for k, goal in enumerate(self._trial.goals):
+            self._goal = k
+            if goal.stable:
+                self._act_until(goal.time)
+                self._open(goal)
+                self._settle(self._settling.limit)  # takes no time of the trial
+                self.events.append(See(k, None))
+            elif k >= seen:
+                self._see(k, goal.time)
+                seen = self._trace(k + 1)
+
+    def _goals(self, first: int) -> Iterator[Goal]:
+        """Yield the goals from an index on, without a copy: a stream has thousands."""
+        for k in range(first, len(self._trial.goals)):
+            yield self._trial.goals[k]
+
+    def _see(self, goal: int, instant: float) -> None:
+        """See the DLO at an instant, between two steps."""
+        self._act_until(instant - self._step)
+        while self._time < instant - ROUNDING:
+            self._last = self._time
+            self._close()
+            self._advance(1, remembers=True)
+            self._open_arrived()
+        share = (instant - self._last) / (self._time - self._last) if self._time > self._last else 0.0
+        self.events.append(See(goal, min(max(share, 0.0), 1.0)))
+
+    def _trace(self, first: int) -> int:
+        """
+        See the DLO at timed goals, from an index on up to the next event of a hand; return the next index.
+
+        The result is the same as for each goal by itself, but one call to the stepper does.
+        """
+        step = self._step
+        self._close()
+        events = [hand.start for hand in self._waiting] + [
+            grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+        end = min(events, default=math.inf) - 2 * step
+        arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
+        last = first
+        for goal in self._goals(first):
+            if goal.stable or goal.time > end or goal.time - self._time > MOST_TRACED * step \
+                    or arrived and not all(self._trial.holds(hand, goal) for hand in arrived):
+                break
+            last += 1
+        count = math.ceil((self._trial.goals[last - 1].time - ROUNDING - self._time) / step)
+        if last == first or count <= 0:
+            return first
+        times = np.concatenate([[self._last], self._time + step * np.arange(count + 1)])
+        steps = self._taken(count)
+        self._last = float(times[-2])
+        instants = np.array([goal.time for goal in self._trial.goals[first:last]])
+        after = np.clip(np.searchsorted(times, instants - ROUNDING), 1, len(times) - 1)
+        widths = times[after] - times[after - 1]
+        shares = np.clip((instants - times[after - 1]) / np.maximum(widths, ROUNDING), 0.0, 1.0)
+        self.events.append(Trace(steps, first, after, shares))
+        return last
+
+    def _act_until(self, until: float) -> None:
+        """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
+        while self._time < until - ROUNDING:
+            self._close()
+            ends = [grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+            starts = [hand.start for hand in self._waiting if hand.start < until]
+            target = min([*ends, *starts, until])
+            if ends or not self._nothing_timed_before(target):
+                self._advance(max(1, math.ceil((target - self._time) / self._step - 1e-6)))
+            else:
+                self._settle(min(target - self._time, self._settling.limit))
+                self._time = target
+            self._open_arrived()
+
+    def _nothing_timed_before(self, instant: float) -> bool:
+        """Tell whether time until an instant may be skipped: no timed goal lies in it."""
+        return bisect_right(self._timed, self._time) >= bisect_right(self._timed, instant + self._step)
+
+    def _close(self) -> None:
+        closing = [hand for hand in self._waiting if hand.start <= self._time + ROUNDING]
+        for hand in closing:
+            self._waiting.remove(hand)
+            nodes = self._layout.nodes(hand)
+            count = max(1, math.ceil((hand.end - self._time) / self._step - ROUNDING))
+            if count > MOST_STEPS:
+                raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
+                                      f'more than {MOST_STEPS}; divide its path into several actions')
+            positions, rotations, turns = hand_steps(hand, self._time, self._step, count)
+            rows = slice(self.places, self.places + len(nodes))
+            self.places = rows.stop
+            self.events.append(Close(rows, list(nodes), positions[0]))
+            self._grips.pop(hand.name, None)
+            self._let_go(nodes)
+            self._grips[hand.name] = _Grip(
+                hand, nodes, np.arange(rows.start, rows.stop), self._steps, positions[1:],
+                None if rotations is None else rotations[1:], turns)
+        if closing:
+            self._hold()
+
+    def _open_arrived(self) -> None:
+        """Open the hands that have arrived, unless the next goal shows them closed."""
+        for grip in list(self._grips.values()):
+            if grip.hand.end <= self._time + ROUNDING:
+                end = grip.hand.end
+                following = next((goal for goal in self._goals(self._goal) if goal.time > end), None)
+                if following is not None and not self._trial.holds(grip.hand, following):
+                    self._release(grip)
+
+    def _open(self, goal: Goal) -> None:
+        """Open the hands that have arrived and that a goal shows open."""
+        for grip in list(self._grips.values()):
+            if grip.hand.end < goal.time and not self._trial.holds(grip.hand, goal):
+                self._release(grip)
+
+    def _let_go(self, nodes: tuple[int, ...]) -> None:
+        """Take nodes from the hands that hold them, because another hand grips them."""
+        for name, grip in list(self._grips.items()):
+            kept = [k for k, node in enumerate(grip.nodes) if node not in nodes]
+            if not kept:
+                del self._grips[name]
+            elif len(kept) < len(grip.nodes):
+                grip.nodes, grip.rows = tuple(grip.nodes[k] for k in kept), grip.rows[kept]
+
+    def _release(self, grip: _Grip) -> None:
+        del self._grips[grip.hand.name]
+        self._hold()
+
+    def _hold(self) -> None:
+        self.events.append(Hold(tuple(node for grip in self._grips.values() for node in grip.nodes)))
+
+    def _advance(self, count: int, remembers: bool = False) -> None:
+        self.events.append(self._taken(count, remembers=remembers))
+
+    def _settle(self, limit: float) -> None:
+        """Let the DLO come to rest, at most for a limit [s], while no hand moves."""
+        time, count = self._time, round(limit / self._step)
+        self.events.append(self._taken(count, settles=True))
+        self._time = time
+
+    def _taken(self, count: int, settles: bool = False, remembers: bool = False) -> Advance:
+        """Take steps."""
+        grips = list(self._grips.values())
+        after = [self._steps - grip.closed for grip in grips]
+        moving = max((len(grip.turns) - k for k, grip in zip(after, grips, strict=True)), default=1)
+        moving = min(max(moving, 1), count)
+        held = tuple(Held(grip.rows, _rows(grip.positions, k, moving),
+                          None if grip.rotations is None else _rows(grip.rotations, k, moving),
+                          _rows(grip.turns, k, moving)) for k, grip in zip(after, grips, strict=True))
+        self._time += count * self._step
+        self._steps += count
+        self.rows += moving * len(grips)
+        return Advance(held, count, settles, remembers)
+
+
+def _rows(array: Floats, first: int, count: int) -> Floats:
+    """Return so many rows of an array; where there are no more, the last one again."""
+    found = array[first:first + count]
+    rest = count - len(found)
+    return np.concatenate([found, np.repeat(array[-1:], rest, axis=0)]) if rest else found
