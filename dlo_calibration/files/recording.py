@@ -20,7 +20,6 @@ from textwrap import indent
 import time
 from typing import Any, BinaryIO, cast, Mapping
 
-from mcap.writer import CompressionType, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
@@ -72,6 +71,8 @@ class SessionWriter:
             self.path, self.file, self._stream = _create(Path(path))
         except OSError as error:
             raise RecordingError(f'session {path}: cannot be written: {error}') from error
+        from mcap.writer import CompressionType, Writer  # takes long to load; who reads does without
+
         self._writer = cast(Any, Writer(self._stream, compression=CompressionType.ZSTD))  # partly untyped
         try:
             with self._disk():

@@ -53,19 +53,29 @@ class CompiledRope(Rope):
 
     def packed_move(self, steps: Steps) -> Packed:
         """Return a `Move` that takes steps of this rope, as kernels take it; it replaces the one before."""
-        rod, nothing = self.state.rod, _NOTHING
-        fields = {
+        rod = self.state.rod
+        fields: dict[str, Any] = {
             'targets': np.ascontiguousarray(steps.targets), 'most': steps.count,
-            'turns': nothing if steps.turns is None else np.ascontiguousarray(steps.turns),
-            'path': nothing if steps.path is None else steps.path, 'periods': steps.periods(self.time_step),
+            'turns': _NOTHING if steps.turns is None else np.ascontiguousarray(steps.turns),
+            'path': _NOTHING if steps.path is None else steps.path, 'periods': steps.periods(self.time_step),
             'distance': 0.0 if steps.settling is None else steps.settling.distance, 'held': rod.held,
-            'follow': rod.follow, 'inverse_masses': rod.inverse_masses, 'contact': self.contact}
+            'follow': rod.follow}
         if self._move is None:
-            self._move = Packed(Move(**fields, seen=np.empty((CHECKS + 1, *self.state.points.shape)),
-                                     progress=np.zeros(4, np.int64)))
+            self._move = Packed(Move(
+                **fields, inverse_masses=rod.inverse_masses, contact=self.contact,
+                progress=np.zeros(4, np.int64), seen=np.empty((CHECKS + 1, *self.state.points.shape))))
         else:
-            self._move.set(**fields)
+            before = self._move.state
+            self._move.set(**{name: value for name, value in fields.items()
+                              if getattr(before, name) is not value})
         return self._move
+
+    def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+              features: Floats | None = None, directions: Floats | None = None) -> None:
+        """Become another DLO of as many nodes at the start of a trial; see the constructor."""
+        super().begin(places, points, velocities, physical, features, directions)
+        if self._move is not None:
+            self._move.set(contact=self.contact)
 
     @property
     def kind(self) -> Hashable:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from contextlib import suppress
 from functools import lru_cache
 import hashlib
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 import os
 from pathlib import Path
@@ -166,8 +165,10 @@ def _name_of(stem: str, sources: tuple[tuple[Path, int], ...]) -> str:
     for source, _ in sources:
         found.update(source.read_bytes())
     for name in ('numba', 'llvmlite'):
-        with suppress(PackageNotFoundError):
-            found.update(version(name).encode())
+        spec = find_spec(name)
+        if spec is not None and spec.origin:
+            with suppress(OSError):  # importlib.metadata would take longer than all the rest
+                found.update(Path(spec.origin).with_name('_version.py').read_bytes())
     found.update(f'{sys.implementation.cache_tag} {platform.machine()}'.encode())
     with suppress(OSError):  # Numba compiles for the processor that it finds
         lines = Path('/proc/cpuinfo').read_text(encoding='utf-8', errors='replace').splitlines()

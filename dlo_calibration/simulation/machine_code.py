@@ -60,17 +60,16 @@ class Packed:
 
         :raises TypeError: if an array is not what the state's annotations tell.
         """
-        state, kind = self.state, cast(type, type(self.state))
-        # The fields of what is packed may have changed.
-        changed = {name: value for name, value in values.items()
-                   if getattr(state, name) is not value or type(value) is Packed}
-        for name, value in changed.items():
+        state, kind, words = self.state, cast(type, type(self.state)), self.words
+        for name, value in values.items():
             layout, start, end = _places(kind)[name]
-            words = array('q')
-            _add(words, (value,), ((name, layout),))
-            self.words[start:end] = words
-        if changed:
-            self.state = state._replace(**changed)
+            if layout is int:
+                words[start] = value
+            else:
+                new = array('q')
+                _add(new, (value,), ((name, layout),))
+                words[start:end] = new
+        self.state = state._replace(**values)
 
 
 class Kernel:

@@ -140,23 +140,21 @@ class RolloutUnderWay:
     def __init__(self, number: int, script: Script, rope: CompiledRope) -> None:
         self.number, self.rope, self._course = number, rope, course(script, rope)
         self.inside = False  # whether its state is in a lane
+        self.left = 0  # steps until its move ends, at most
         self.kind: Hashable = None
         self.outcome: Rollout | SimulationError | None = None
         self._take_next(None)
 
     @property
-    def left(self) -> int:
-        """The steps until its move ends, at most."""
-        return self._steps.count - int(self._progress[0])
-
-    @property
     def arrived(self) -> bool:
         """Whether its move has ended."""
-        return self.left == 0 or bool(self._progress[3] != GOES_ON)
+        taken, _, _, ending = self.move.state.progress.tolist()
+        self.left = self._steps.count - taken
+        return self.left == 0 or ending != GOES_ON
 
     def go_on(self) -> None:
         """Go on after a move."""
-        taken, _, _, ending = self._progress.tolist()
+        taken, _, _, ending = self.move.state.progress.tolist()
         if ending == DIVERGED:
             self.outcome = diverged()
         else:
@@ -188,8 +186,8 @@ class RolloutUnderWay:
             rope.advance(steps.targets[:1], None if steps.path is None else steps.path[:1],
                          None if steps.turns is None else steps.turns[:1])
         until_check = periods[0] - first if len(periods) else 0
-        self._progress = self.move.state.progress
-        self._progress[:] = first, until_check, 0, GOES_ON
+        self.move.state.progress[:] = first, until_check, 0, GOES_ON
+        self.left = steps.count - first
         self.kind = rope.kind
         return True
 

@@ -110,9 +110,9 @@ def test_one_that_diverges_does_not_disturb_the_others():
 def test_what_was_simulated_before_makes_no_difference():
     used = CompiledSimulator(table=False, nodes=21)
     trials = [carried(0.1, 0.2), replace(turned(1.0), places=np.linspace(0, 0.6, 21))]
-    changes = [{}, {'elasticity': float('nan')}, {'torsion': 0.0, 'natural_curvature': 0.0},
-               {'self_collision': 0.012, 'stiffness_2': 3.0}]
-    jobs = [(trial, {**physical, **one}) for physical in drawn(CABLES, 2) for trial in trials for one in changes]
+    sets = [{}, {'elasticity': float('nan')}, {'torsion': 0.0, 'natural_curvature': 0.0},
+            {'self_collision': 0.012, 'stiffness_2': 3.0}]
+    jobs = [(trial, {**physical, **one}) for physical in drawn(CABLES, 2) for trial in trials for one in sets]
     for _ in range(2):
         for job, found in zip(jobs, simulate_all(used, jobs, nothing), strict=True):
             new = list(simulate_all(CompiledSimulator(table=False, nodes=21), [job], nothing))
