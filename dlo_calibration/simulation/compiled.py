@@ -55,7 +55,7 @@ class CompiledRope(Rope):
         """Return a `Move` that takes steps of this rope, as kernels take it; it replaces the one before."""
         rod = self.state.rod
         fields: dict[str, Any] = {
-            'targets': np.ascontiguousarray(steps.targets), 'most': steps.count,
+            'targets': np.ascontiguousarray(steps.targets), 'most': steps.number,
             'turns': _NOTHING if steps.turns is None else np.ascontiguousarray(steps.turns),
             'path': _NOTHING if steps.path is None else steps.path, 'periods': steps.periods(self.time_step),
             'distance': 0.0 if steps.settling is None else steps.settling.distance, 'held': rod.held,
@@ -65,9 +65,8 @@ class CompiledRope(Rope):
                 **fields, inverse_masses=rod.inverse_masses, contact=self.contact,
                 progress=np.zeros(4, np.int64), seen=np.empty((CHECKS + 1, *self.state.points.shape))))
         else:
-            before = self._move.state
-            self._move.set(**{name: value for name, value in fields.items()
-                              if getattr(before, name) is not value})
+            move = self._move
+            move.set(**{name: value for name, value in fields.items() if move[name] is not value})
         return self._move
 
     def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],

@@ -22,7 +22,7 @@ import json
 from pathlib import Path
 import struct
 import threading
-from typing import Any, Callable, cast, Iterable, NamedTuple, Sequence
+from typing import Any, Callable, Iterable, NamedTuple, Sequence
 
 import numpy as np
 
@@ -47,12 +47,23 @@ class Packed:
     :raises TypeError: if an array is not what the state's annotations tell.
     """
 
-    __slots__ = ('state', 'words')
+    __slots__ = ('_fields', 'kind', 'words')
 
-    def __init__(self, state: tuple[Any, ...]) -> None:
-        self.state: Any = state
+    def __init__(self, state: Any) -> None:
+        kind: type = type(state)
+        self.kind = kind
+        self._fields: dict[str, Any] = state._asdict()
         self.words = array('q')
-        _add(self.words, state, fields_of(type(state)))
+        _add(self.words, state, fields_of(kind))
+
+    @property
+    def state(self) -> Any:
+        """The state, with values of others that are packed."""
+        return self.kind(**self._fields)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a field of the state."""
+        return self._fields[name]
 
     def set(self, **values: Any) -> None:
         """
@@ -60,16 +71,16 @@ class Packed:
 
         :raises TypeError: if an array is not what the state's annotations tell.
         """
-        state, kind, words = self.state, cast(type, type(self.state)), self.words
+        places, words = _places(self.kind), self.words
         for name, value in values.items():
-            layout, start, end = _places(kind)[name]
+            layout, start, end = places[name]
             if layout is int:
                 words[start] = value
             else:
                 new = array('q')
                 _add(new, (value,), ((name, layout),))
                 words[start:end] = new
-        self.state = state._replace(**values)
+        self._fields.update(values)
 
 
 class Kernel:
@@ -216,7 +227,7 @@ def _add(words: array[int], values: Iterable[Any], fields: Iterable[tuple[str, A
                                 f'one of {layout[0]} with {layout[1]}, in one piece and not read-only')
             words.append(_address(_start(value)) if value.size else 0)
             words.extend(value.shape)
-        elif kind is Packed and type(value.state) is layout:
+        elif kind is Packed and value.kind is layout:
             words.extend(value.words)
         elif layout is int:
             words.append(int(value))

@@ -128,6 +128,7 @@ class Rod:
     def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
                  features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
+        self._places: dict[tuple[int, ...], tuple[NDArray[np.int64], Floats]] = {}  # of held nodes
         self.state = RodState(
             rest_lengths=np.empty(n - 1), stiffness=np.empty(n - 1), masses=np.empty(n),
             inverse_masses=np.empty(n), bending=np.empty((3, n)), frame=_no_frame(), friction=_no_friction(),
@@ -169,10 +170,13 @@ class Rod:
         if tuple(nodes) == self._held:
             return
         self._held = tuple(nodes)
-        held = np.array(self._held, np.int64)
-        follows, rigid, cells, weights, bands = _cells(self._lengths, self._held)
+        rigid, cells, weights, bands = _cells(self._lengths, self._held)
+        if self._held not in self._places:
+            self._places[self._held] = np.array(self._held, np.int64), np.empty((len(self._held), 3))
+        held, follow = self._places[self._held]
         np.divide(1.0, state.masses, out=state.inverse_masses)
-        state.inverse_masses[follows] = 0.0
+        state.inverse_masses[held] = 0.0
+        follow[:] = 0.0
         frame, friction = state.frame, state.friction
         if self._uniform:
             np.multiply(self._properties.bending_stiffness, bands, out=state.bending)
@@ -184,7 +188,7 @@ class Rod:
             if not self._uniform:
                 state.bending[...] = _bending_bands(self._rows, joints)
         self.state = state._replace(
-            held=held, follow=np.zeros((len(held), 3)), frame=frame, friction=friction)
+            held=held, follow=follow, frame=frame, friction=friction)
 
     @property
     def _framed(self) -> bool:
@@ -307,11 +311,11 @@ def _rows_and_weights(lengths: bytes) -> tuple[Floats, Floats, float]:
 
 @lru_cache(maxsize=256)
 def _cells(lengths: bytes, held: tuple[int, ...]
-           ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats, Floats, Floats]:
+           ) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:
     """
     Return what depends on the rest lengths and on the held nodes.
 
-    :returns: (N,) which nodes are held; (N - 1,) which segments are rigid; (N - 2,) [m] the length that
+    :returns: (N - 1,) which segments are rigid; (N - 2,) [m] the length that
         bends at each inner node; (N - 2,) [1/m] its inverse, 0 where nothing bends; and the bending matrix
         of a DLO whose bending stiffness is 1 N m^2, see `_bending_bands`.
     """
@@ -323,7 +327,7 @@ def _cells(lengths: bytes, held: tuple[int, ...]
     cells = (bendable[:-1] + bendable[1:]) / 2
     weights = np.divide(1.0, cells, out=np.zeros_like(cells), where=cells > 0)
     bands = _bending_bands(_rows_and_weights(lengths)[0], weights)
-    return follows, rigid, frozen_array(cells), frozen_array(weights), frozen_array(bands)
+    return rigid, frozen_array(cells), frozen_array(weights), frozen_array(bands)
 
 
 def _bending_bands(rows: Floats, joints: Floats) -> Floats:

@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import cycle
 import math
-from typing import Generator, Protocol, Sequence
+from typing import Generator, NamedTuple, Protocol, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,22 +22,21 @@ CHECKS = 5  # of the displacement within one `Settling.time`
 PIECE = 1000  # steps in one call of a stepper: at most some seconds, even with 1000 nodes
 
 
-@dataclass(frozen=True)
-class Steps:
+class Steps(NamedTuple):
     """
     What a trial asks of a stepper next.
 
     :param targets: (k, h, 3) [m] positions of the held nodes after each step; after k steps, they stay.
     :param turns: (k, h, 9) rotation matrices of their hands in each step, row by row; None: it makes no
         difference how they turn.
-    :param count: number of steps; with `settling`, the most.
-    :param path: (count, N, 3) [m] where the nodes' positions after each step are written; None: nowhere.
+    :param number: of steps; with `settling`, at most.
+    :param path: (number, N, 3) [m] where the nodes' positions after each step are written; None: nowhere.
     :param settling: the steps end as soon as the DLO is stable; None: they do not.
     """
 
     targets: Floats
     turns: Floats | None
-    count: int
+    number: int
     path: Floats | None = None
     settling: Settling | None = None
 
@@ -166,16 +164,16 @@ def take(stepper: Stepper, steps: Steps) -> tuple[int, bool]:
         taken += count
 
     if steps.settling is None:
-        while taken < steps.count:
-            advance(min(PIECE, steps.count - taken))
+        while taken < steps.number:
+            advance(min(PIECE, steps.number - taken))
         return taken, False
     seen: deque[Floats] = deque([stepper.points], maxlen=CHECKS + 1)  # over one window
     for count in cycle(steps.periods(stepper.time_step).tolist()):
-        advance(min(count, steps.count - taken))
+        advance(min(count, steps.number - taken))
         seen.append(stepper.points)
         if len(seen) > CHECKS and _largest_move(seen) < steps.settling.distance:
             return taken, True
-        if taken == steps.count:
+        if taken == steps.number:
             break
     return taken, False
 

@@ -5,7 +5,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
+import math
 from typing import Any, Mapping, Sequence
 
 import numpy as np
@@ -64,11 +68,11 @@ class Rope:
         # A rest shape of unknown direction turns to where the DLO is bent at the start.
         self._directions = {} if directions is None or not properties.rest_curvature else _in_clamps(
             directions, np.diff(self.state.points, axis=0), places, properties.clamp_twist)
-        half, middles, widest = _widest_gaps(self._rod.state.rest_lengths.tobytes())
-        self.contact.set(half=half, middles=middles, **_sizes(half, widest, physical['self_collision']),
-                         friction=float(physical['friction']))
-        start_distances(self.contact, self.state.points)
-        self.state = self.state._replace(rod=self._rod.state, contact=self.contact.state)
+        contact, sizes = self.contact, _Sizes.of(self._rod.state.rest_lengths.tobytes())
+        contact['half'][:], contact['middles'][:] = sizes.half, sizes.middles
+        contact.set(**sizes.at(physical['self_collision']), friction=float(physical['friction']))
+        start_distances(contact, self.state.points)
+        self.state = self.state._replace(rod=self._rod.state, contact=contact.state)
 
     @property
     def points(self) -> Floats:
@@ -120,11 +124,11 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> SelfCo
     :param radius: self-collision radius [m].
     :param friction: Coulomb coefficient.
     """
-    half, middles, widest = _widest_gaps(rest_lengths.tobytes())
-    segments = len(half)
+    sizes = _Sizes.of(rest_lengths.tobytes())
+    segments = len(sizes.half)
     count = segments * (segments - 1) // 2
     return SelfContact(
-        half=half, middles=middles, **_sizes(half, widest, radius), friction=float(friction),
+        half=sizes.half.copy(), middles=sizes.middles.copy(), **sizes.at(radius), friction=float(friction),
         distances=np.empty((segments, segments)), pairs=np.empty((count, 2), np.int64),
         near=np.zeros(1, np.int64), room=np.full(3, -1.0),
         contacts=np.empty(count, CONTACT),
@@ -132,28 +136,37 @@ def self_contact(rest_lengths: Floats, radius: float, friction: float) -> SelfCo
         overlaps=np.zeros(1, np.int64))
 
 
-def _sizes(half: Floats, widest: Floats, radius: float) -> dict[str, Any]:
-    """Return what of a `SelfContact` depends on the radius [m]; see `_widest_gaps`."""
-    apart = max(np.pi * radius, float(half.max()))
-    beyond = np.flatnonzero(widest > apart).tolist()
-    return {'diameter': 2.0 * radius, 'apart': apart, 'next_one': beyond[0] if beyond else len(half)}
-
-
-@lru_cache(maxsize=256)
-def _widest_gaps(lengths: bytes) -> tuple[Floats, Floats, Floats]:
+@dataclass(frozen=True)
+class _Sizes:
     """
-    Return what depends on the lengths of S segments alone, each (S,) [m].
+    What of a `SelfContact` depends on the lengths of S segments alone.
 
-    :returns: `half` and `middles` of `SelfContact`; the largest arc length between two segments, by
-        how many segments one is further than the other.
+    :param half: (S,) [m] see `SelfContact`, like `middles`.
+    :param longest: half the length of the longest segment [m].
+    :param widest: (S,) [m] the largest arc length between two segments, one of which is at most so many
+        segments further than the other.
     """
-    rest_lengths = np.frombuffer(lengths)
-    half = rest_lengths / 2
-    middles = rest_lengths.cumsum() - half
-    starts, ends = middles - half, middles + half
-    gaps = [float((starts[k:] - ends[:len(ends) - k]).max()) for k in range(len(half))]
-    # Kernels take arrays that can be written to, but write to neither of these.
-    return half, middles, frozen_array(gaps)
+
+    half: Floats
+    middles: Floats
+    longest: float
+    widest: list[float]
+
+    @classmethod
+    @lru_cache(maxsize=256)
+    def of(cls, lengths: bytes) -> _Sizes:
+        """Return them for the octets of an array of lengths [m]."""
+        rest_lengths = np.frombuffer(lengths)
+        half = rest_lengths / 2
+        middles = rest_lengths.cumsum() - half
+        starts, ends = middles - half, middles + half
+        gaps = [float((starts[k:] - ends[:len(ends) - k]).max()) for k in range(len(half))]
+        return cls(frozen_array(half), frozen_array(middles), float(half.max()), list(accumulate(gaps, max)))
+
+    def at(self, radius: float) -> dict[str, Any]:
+        """Return what depends on the self-collision radius [m], too."""
+        apart = max(math.pi * radius, self.longest)
+        return {'diameter': 2.0 * radius, 'apart': apart, 'next_one': bisect_right(self.widest, apart)}
 
 
 def diverged() -> SimulationError:

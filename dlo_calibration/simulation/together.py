@@ -148,13 +148,13 @@ class RolloutUnderWay:
     @property
     def arrived(self) -> bool:
         """Whether its move has ended."""
-        taken, _, _, ending = self.move.state.progress.tolist()
-        self.left = self._steps.count - taken
+        taken, _, _, ending = self.move['progress'].tolist()
+        self.left = self._steps.number - taken
         return self.left == 0 or ending != GOES_ON
 
     def go_on(self) -> None:
         """Go on after a move."""
-        taken, _, _, ending = self.move.state.progress.tolist()
+        taken, _, _, ending = self.move['progress'].tolist()
         if ending == DIVERGED:
             self.outcome = diverged()
         else:
@@ -178,16 +178,16 @@ class RolloutUnderWay:
         rope, steps = self.rope, self._steps
         periods = steps.periods(rope.time_step)
         first = 0 if rope.has_begun else 1
-        if steps.count <= first or len(periods) and periods[0] <= first:
+        if steps.number <= first or len(periods) and periods[0] <= first:
             return False
         self.move = rope.packed_move(steps)
-        self.move.state.seen[0] = rope.state.points
+        self.move['seen'][0] = rope.state.points
         if first:
             rope.advance(steps.targets[:1], None if steps.path is None else steps.path[:1],
                          None if steps.turns is None else steps.turns[:1])
         until_check = periods[0] - first if len(periods) else 0
-        self.move.state.progress[:] = first, until_check, 0, GOES_ON
-        self.left = steps.count - first
+        self.move['progress'][:] = first, until_check, 0, GOES_ON
+        self.left = steps.number - first
         self.kind = rope.kind
         return True
 
@@ -221,13 +221,14 @@ def roll_out_together(starts: Iterable[Callable[[], tuple[Script, CompiledRope]]
             free.append(one.rope)
         if not rollouts:
             continue
-        counts = Counter(one.kind for one in rollouts)
-        if counts[kind] < min(COUNT, max(counts.values())):
-            if kind in rooms:
-                rooms[kind].let_in([])
-            kind = counts.most_common(1)[0][0]
-        going = sorted((one for one in rollouts if one.kind == kind), key=lambda one: not one.inside)
-        going = going[:COUNT]
+        going = [one for one in rollouts if one.kind == kind]
+        if len(going) < min(COUNT, len(rollouts)):
+            most, count = Counter(one.kind for one in rollouts).most_common(1)[0]
+            if len(going) < min(COUNT, count):
+                if kind in rooms:
+                    rooms[kind].let_in([])
+                kind, going = most, [one for one in rollouts if one.kind == most]
+        going = [*(one for one in going if one.inside), *(one for one in going if not one.inside)][:COUNT]
         if kind not in rooms:
             rooms[kind] = Lanes(going[0].rope)
         lanes = rooms[kind]
