@@ -50,7 +50,7 @@ class Rope:
             points=points, velocities=np.array(velocities, dtype=float), predicted=np.zeros_like(points),
             support=np.zeros_like(points), gravity=np.array(gravity, dtype=float), rod=self._rod.state,
             contact=contact)
-        self._packed: Packed | None = None
+        self._packed: tuple[RopeState, Packed] | None = None
         self._begin(places, properties, physical, directions)
 
     def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
@@ -92,9 +92,9 @@ class Rope:
     @property
     def packed(self) -> Packed:
         """Its state, as kernels take it."""
-        if self._packed is None or self._packed.state is not self.state:
-            self._packed = Packed(self.state)
-        return self._packed
+        if self._packed is None or self._packed[0] is not self.state:
+            self._packed = self.state, Packed(self.state)
+        return self._packed[1]
 
 
 def _in_clamps(directions: Floats, segments: Floats, places: Floats, twist: float) -> dict[int, Floats]:
