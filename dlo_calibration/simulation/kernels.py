@@ -40,35 +40,59 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     """
     Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 
-    :param bands: (m + 6, 7) columns of the lower triangle, the last six rows unused; destroyed.
-    :param right: (m + 6,) right side; becomes the solution.
+    Each column is finished at once from the six before it: what waits for the last pivot never waits for
+    the memory.
+
+    :param bands: (6 + m, 7) columns of the lower triangle after six of zeros; becomes 1 / D and L D.
+    :param right: (m,) right side; becomes the solution.
     :returns: False if the matrix is not positive definite or a value is not finite.
     """
-    size = len(right) - BAND + 1
+    size = len(right)
+    least, inverse = math.inf, 0.0  # of the pivots; of the last one
+    a1, a2, a3, a4, a5, a6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # of the last column
+    r1, r2, r3, r4, r5, r6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # last values
     for j in range(size):
-        pivot = bands[j, 0]
-        inverse = 1.0 / pivot
-        positive: bool = pivot > 0.0
-        if not every(positive):
-            if not some(positive):
-                return positive
-            inverse = where(positive, inverse, math.nan)
-        for k in range(1, BAND):
-            factor = bands[j, k] * inverse
-            for i in range(BAND - k):
-                bands[j + k, i] -= factor * bands[j, k + i]
-        for k in range(1, BAND):
-            bands[j, k] *= inverse
-            right[j + k] -= bands[j, k] * right[j]
-        right[j] *= inverse
+        column, value = bands[j + 6], right[j]
+        b0, b1, b2, b3 = column[0], column[1], column[2], column[3]
+        b4, b5, b6 = column[4], column[5], column[6]
+        one = bands[j]
+        share = one[6] * one[0]
+        b0, value = b0 - share * one[6], value - share * r6
+        one = bands[j + 1]
+        share = one[5] * one[0]
+        b0, b1, value = b0 - share * one[5], b1 - share * one[6], value - share * r5
+        one = bands[j + 2]
+        share = one[4] * one[0]
+        b0, b1, b2 = b0 - share * one[4], b1 - share * one[5], b2 - share * one[6]
+        value -= share * r4
+        one = bands[j + 3]
+        share = one[3] * one[0]
+        b0, b1, b2, b3 = b0 - share * one[3], b1 - share * one[4], b2 - share * one[5], b3 - share * one[6]
+        value -= share * r3
+        one = bands[j + 4]
+        share = one[2] * one[0]
+        b0, b1, b2, b3 = b0 - share * one[2], b1 - share * one[3], b2 - share * one[4], b3 - share * one[5]
+        b4, value = b4 - share * one[6], value - share * r2
+        share = a1 * inverse
+        b0, b1, b2, b3 = b0 - share * a1, b1 - share * a2, b2 - share * a3, b3 - share * a4
+        b4, b5, value = b4 - share * a5, b5 - share * a6, value - share * r1
+        least, inverse = min(least, b0), 1.0 / b0
+        a1, a2, a3, a4, a5, a6 = b1, b2, b3, b4, b5, b6
+        r1, r2, r3, r4, r5, r6 = value, r1, r2, r3, r4, r5
+        column[0], column[1], column[2], column[3] = inverse, b1, b2, b3
+        column[4], column[5], column[6] = b4, b5, b6
+        right[j] = value * inverse
     total = 0.0
+    r1, r2, r3, r4, r5, r6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(size - 1, -1, -1):
-        value = right[j]
-        for k in range(BAND - 1, 0, -1):  # the one that is known last comes last: no waiting
-            value -= bands[j, k] * right[j + k]
+        column, value = bands[j + 6], right[j]
+        inverse = column[0]
+        value = value - column[6] * inverse * r6 - column[5] * inverse * r5 - column[4] * inverse * r4
+        value = value - column[3] * inverse * r3 - column[2] * inverse * r2 - column[1] * inverse * r1
+        r1, r2, r3, r4, r5, r6 = value, r1, r2, r3, r4, r5
         right[j] = value
         total += value
-    solved: bool = finite(total)
+    solved: bool = both(finite(total), least > 0.0)
     return solved
 
 
@@ -130,18 +154,13 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
     :returns: False if the rollout diverges.
     """
     rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
-    held, follow, bands, right = rod.held, rod.follow, rod.bands, rod.right
+    held, follow, bands, right = rod.held, rod.follow, rod.bands[BAND - 1:], rod.right
     drag, implicit, step = rod.drag, rod.implicit, rod.step
     n = len(points)
-    size = 3 * n
     framed, segments = len(rod.frame.angles) > 0, rod.frame.segments
     rubs, pull = len(rod.friction.rows) > 0, rod.friction.pull
     if rubs:
         rub(rod.friction, points, step)
-    for j in range(size, size + BAND - 1):
-        right[j] = 0.0
-        for k in range(BAND):
-            bands[j, k] = 0.0
     for i in range(n):
         diagonal = masses[i] * (1.0 + drag * step) + implicit * bending[0, i]
         first, second = implicit * bending[1, i], implicit * bending[2, i]
@@ -212,7 +231,7 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
     if framed:
         add_frame(rod.frame, step, right)
     _hold(bands, right, masses, held, follow)
-    solved = _solve(bands, right)
+    solved = _solve(rod.bands, right)
     for i in range(n):
         for c in range(3):
             predicted[i, c] = right[3 * i + c]

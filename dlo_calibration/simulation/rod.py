@@ -133,8 +133,8 @@ class Rod:
             rest_lengths=np.empty(n - 1), stiffness=np.empty(n - 1), masses=np.empty(n),
             inverse_masses=np.empty(n), bending=np.empty((3, n)), frame=_no_frame(), friction=_no_friction(),
             held=np.zeros(0, np.int64), follow=np.zeros((0, 3)), drag=0.0, implicit=0.0,
-            step=float(time_step), bands=np.empty((3 * n + BAND - 1, BAND)),
-            right=np.empty(3 * n + BAND - 1))
+            step=float(time_step), bands=np.zeros((BAND - 1 + 3 * n, BAND)),
+            right=np.empty(3 * n))
         self.begin(rest_lengths, properties, features)
 
     def begin(self, rest_lengths: Floats, properties: RodProperties, features: Floats | None = None) -> None:

@@ -155,8 +155,8 @@ class RodState(NamedTuple):
     :param drag: acceleration against the velocity [1/s].
     :param implicit: c [s^2] of the step; see `rod`.
     :param step: time step [s].
-    :param bands: (3 N + 6, 7) workspace: columns of the lower triangle of the matrix.
-    :param right: (3 N + 6,) workspace: right side.
+    :param bands: (6 + 3 N, 7) workspace: six of zeros, then the columns of the lower triangle of the matrix.
+    :param right: (3 N,) workspace: right side.
     """
 
     rest_lengths: Vector
