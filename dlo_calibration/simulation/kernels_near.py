@@ -70,17 +70,15 @@ def start_distances(contact: SelfContact, points: Matrix) -> None:
 @part
 def movement(velocities: Matrix, step: float) -> tuple[float, float]:
     """Return upper bounds [m] of how two nodes, and two neighbours, move against each other in a step."""
-    n = len(velocities)
-    middle = n // 2
+    middle, before = velocities[len(velocities) // 2], velocities[0]
     away, beside = 0.0, 0.0
-    for i in range(n):
-        x, y = velocities[i, 0] - velocities[middle, 0], velocities[i, 1] - velocities[middle, 1]
-        z = velocities[i, 2] - velocities[middle, 2]
+    for i in range(len(velocities)):
+        here = velocities[i]
+        x, y, z = here[0] - middle[0], here[1] - middle[1], here[2] - middle[2]
         away = max(away, x * x + y * y + z * z)
-    for i in range(n - 1):
-        x, y = velocities[i + 1, 0] - velocities[i, 0], velocities[i + 1, 1] - velocities[i, 1]
-        z = velocities[i + 1, 2] - velocities[i, 2]
+        x, y, z = here[0] - before[0], here[1] - before[1], here[2] - before[2]
         beside = max(beside, x * x + y * y + z * z)
+        before = here
     return 2 * step * math.sqrt(away), step * math.sqrt(beside)
 
 
