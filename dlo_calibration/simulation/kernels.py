@@ -161,73 +161,57 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
     rubs, pull = len(rod.friction.rows) > 0, rod.friction.pull
     if rubs:
         rub(rod.friction, points, step)
-    for i in range(n):
-        diagonal = masses[i] * (1.0 + drag * step) + implicit * bending[0, i]
-        first, second = implicit * bending[1, i], implicit * bending[2, i]
-        if rubs:
-            diagonal += pull[i, 0]
-            first += pull[i, 1]
-            second += pull[i, 2]
-        for c in range(3):
-            j = 3 * i + c
-            bands[j, 0] = diagonal
-            bands[j, 1] = 0.0
-            bands[j, 2] = 0.0
-            bands[j, 3] = first
-            bands[j, 4] = 0.0
-            bands[j, 5] = 0.0
-            bands[j, 6] = second
-            force = bending[0, i] * points[i, c]
-            if i + 1 < n:
-                force += bending[1, i] * points[i + 1, c]
-            if i + 2 < n:
-                force += bending[2, i] * points[i + 2, c]
-            if i > 0:
-                force += bending[1, i - 1] * points[i - 1, c]
-            if i > 1:
-                force += bending[2, i - 2] * points[i - 2, c]
-            right[j] = masses[i] * velocities[i, c] - step * force
-            if rubs:
-                right[j] -= pull[i, 3 + c]
-    for i in range(n - 1):
-        x = points[i + 1, 0] - points[i, 0]
-        y = points[i + 1, 1] - points[i, 1]
-        z = points[i + 1, 2] - points[i, 2]
-        square = x * x + y * y + z * z
-        inverse = 1.0 / math.sqrt(square)
+    springs = predicted  # workspace: across and along the segment behind each node [kg], and impulse [kg/s]
+    for i in range(n - 1):  # by themselves: roots and divisions take long, but not if there are many
+        here, there = points[i], points[i + 1]
+        x, y, z = there[0] - here[0], there[1] - here[1], there[2] - here[2]
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
         slack = 1.0 - rest[i] * inverse
+        across = max(slack, 0.0) * stiffness[i]
+        springs[i, 0], springs[i, 2] = across * implicit, stiffness[i] * slack * step
+        springs[i, 1] = implicit * (stiffness[i] - across) * inverse * inverse
         if framed:
             segments[i, 0], segments[i, 1], segments[i, 2] = x * inverse, y * inverse, z * inverse
             segments[i, 3] = inverse
-        tension = stiffness[i] * slack * step
-        across = max(slack, 0.0) * stiffness[i]
-        along = implicit * (stiffness[i] - across) * inverse * inverse
-        across *= implicit
+    for c in range(3):
+        springs[n - 1, c] = 0.0
+    # What the segment before a node adds to its equations, then what the one behind it does.
+    xx, yy, zz, xy, xz, yz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        here, speed, mass, share = points[i], velocities[i], masses[i], bending[0, i]
+        x, y, z = 0.0, 0.0, 0.0
+        fx, fy, fz = share * here[0], share * here[1], share * here[2]
+        if i + 1 < n:
+            there, share = points[i + 1], bending[1, i]
+            x, y, z = there[0] - here[0], there[1] - here[1], there[2] - here[2]
+            fx, fy, fz = fx + share * there[0], fy + share * there[1], fz + share * there[2]
+        if i + 2 < n:
+            there, share = points[i + 2], bending[2, i]
+            fx, fy, fz = fx + share * there[0], fy + share * there[1], fz + share * there[2]
+        if i > 0:
+            there, share = points[i - 1], bending[1, i - 1]
+            fx, fy, fz = fx + share * there[0], fy + share * there[1], fz + share * there[2]
+        if i > 1:
+            there, share = points[i - 2], bending[2, i - 2]
+            fx, fy, fz = fx + share * there[0], fy + share * there[1], fz + share * there[2]
+        rx, ry, rz = mass * speed[0] - step * fx, mass * speed[1] - step * fy, mass * speed[2] - step * fz
+        diagonal = mass * (1.0 + drag * step) + implicit * bending[0, i]
+        first, second = implicit * bending[1, i], implicit * bending[2, i]
+        if rubs:
+            diagonal, first, second = diagonal + pull[i, 0], first + pull[i, 1], second + pull[i, 2]
+            rx, ry, rz = rx - pull[i, 3], ry - pull[i, 4], rz - pull[i, 5]
+        one, two, three, j = bands[3 * i], bands[3 * i + 1], bands[3 * i + 2], 3 * i
+        ax, ay, az, rx, ry, rz = diagonal + xx, diagonal + yy, diagonal + zz, rx - tx, ry - ty, rz - tz
+        bxy, bxz, byz = xy, xz, yz
+        across, along, impulse = springs[i, 0], springs[i, 1], springs[i, 2]
         xx, yy, zz = along * x * x + across, along * y * y + across, along * z * z + across
         xy, xz, yz = along * x * y, along * x * z, along * y * z
-        j = 3 * i
-        right[j] += tension * x
-        right[j + 1] += tension * y
-        right[j + 2] += tension * z
-        right[j + 3] -= tension * x
-        right[j + 4] -= tension * y
-        right[j + 5] -= tension * z
-        for start in (j, j + 3):
-            bands[start, 0] += xx
-            bands[start, 1] += xy
-            bands[start, 2] += xz
-            bands[start + 1, 0] += yy
-            bands[start + 1, 1] += yz
-            bands[start + 2, 0] += zz
-        bands[j, 3] -= xx
-        bands[j, 4] -= xy
-        bands[j, 5] -= xz
-        bands[j + 1, 2] -= xy
-        bands[j + 1, 3] -= yy
-        bands[j + 1, 4] -= yz
-        bands[j + 2, 1] -= xz
-        bands[j + 2, 2] -= yz
-        bands[j + 2, 3] -= zz
+        tx, ty, tz = impulse * x, impulse * y, impulse * z
+        right[j], right[j + 1], right[j + 2] = rx + tx, ry + ty, rz + tz
+        one[0], one[1], one[2], one[3], one[4], one[5] = ax + xx, bxy + xy, bxz + xz, first - xx, -xy, -xz
+        two[0], two[1], two[2], two[3], two[4], two[5] = ay + yy, byz + yz, -xy, first - yy, -yz, 0.0
+        three[0], three[1], three[2], three[3], three[4], three[5] = az + zz, -xz, -yz, first - zz, 0.0, 0.0
+        one[6], two[6], three[6] = second, second, second
     if framed:
         add_frame(rod.frame, step, right)
     _hold(bands, right, masses, held, follow)
