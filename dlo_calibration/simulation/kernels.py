@@ -20,7 +20,7 @@ from dlo_calibration.simulation.kernels_contact import keep_apart
 from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
 from dlo_calibration.simulation.kernels_near import is_near, movement
 from dlo_calibration.simulation.kernels_slip import rub
-from dlo_calibration.simulation.lanes import both, every, finite, LANES, numbers_of, some, where
+from dlo_calibration.simulation.lanes import both, finite, LANES, numbers_of, some, where
 from dlo_calibration.simulation.states import (
     BAND,
     COUNT,
