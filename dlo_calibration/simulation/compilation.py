@@ -35,7 +35,11 @@ def of_numbers(kernel: Function) -> Function:
 
 
 def inlined(kernel: Function) -> Function:
-    """Compile a function as a piece of the kernels that call it, in their loops."""
+    """
+    Compile a function as a piece of the kernels that call it, in their loops.
+
+    A call would push all words of its arrays, hundreds for a `Move`, at each step.
+    """
     compile_: Any = numba.njit(inline='always', error_model='numpy')
     return compile_(kernel)  # type: ignore[no-any-return]
 

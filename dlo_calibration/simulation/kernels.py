@@ -15,7 +15,7 @@ import math
 from typing import Any
 
 from dlo_calibration.simulation import entries
-from dlo_calibration.simulation.compilation import entry, one_or_each, part
+from dlo_calibration.simulation.compilation import entry, inlined, one_or_each, part
 from dlo_calibration.simulation.kernels_contact import keep_apart
 from dlo_calibration.simulation.kernels_frame import add_frame, turn_clamps
 from dlo_calibration.simulation.kernels_near import is_near, movement
@@ -96,7 +96,7 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     return solved
 
 
-@part
+@inlined
 def _hold_one(bands: Matrix, right: Vector, masses: Vector, held: Indices, follow: Matrix) -> None:
     for h in range(len(held)):
         pull = HELD * masses[held[h]]
@@ -123,7 +123,7 @@ def _hold_in(bands: Matrix, right: Vector, masses: Vector, held: Indices, follow
     return each
 
 
-@part
+@inlined
 def _let_follow_one(predicted: Matrix, held: Indices, follow: Matrix) -> None:
     for h in range(len(held)):
         for c in range(3):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from dlo_calibration.simulation import entries
-from dlo_calibration.simulation.compilation import entry, of_numbers, part
+from dlo_calibration.simulation.compilation import entry, inlined, of_numbers, part
 from dlo_calibration.simulation.kernels_contact import closest
 from dlo_calibration.simulation.states import Matrix, SelfContact
 
@@ -130,6 +130,23 @@ def _find_room(contact: SelfContact, points: Matrix) -> None:
 
 
 @part
+def _look_around(contact: SelfContact, points: Matrix, coming: tuple[float, float]) -> None:
+    """Find the pairs of segments that are near, if the DLO may touch itself in a step; see `is_near`."""
+    near, room = contact.near, contact.room
+    _find_room(contact, points)
+    if room[0] >= coming[1] and room[1] >= coming[0]:
+        room[2] = -1.0
+        near[0] = 0
+        if contact.overlaps[0] == 1:
+            contact.distances[:] = contact.diameter
+            contact.overlaps[0] = 0
+        return
+    room[2] = coming[0] + min(max(SKIN[0], STEPS_AHEAD * coming[0]), SKIN[1])
+    near[0] = near_pairs(contact, points, 1.2, room[2])  # a segment may be stretched by 20 %
+    room[:2] = -1.0
+
+
+@inlined
 def is_near(contact: SelfContact, points: Matrix, last: tuple[float, float],
             coming: tuple[float, float]) -> bool:
     """
@@ -138,21 +155,12 @@ def is_near(contact: SelfContact, points: Matrix, last: tuple[float, float],
     :param last: `movement` in the last step.
     :param coming: `movement` in this step without contact.
     """
-    near, room = contact.near, contact.room
+    room = contact.room
     room[0] -= last[1]
     room[1] -= last[0]
     room[2] -= last[0]
     if room[0] >= coming[1] and room[1] >= coming[0]:
         return False
     if room[2] < coming[0]:
-        _find_room(contact, points)
-        if room[0] >= coming[1] and room[1] >= coming[0]:
-            room[2] = -1.0
-            if contact.overlaps[0] == 1:
-                contact.distances[:] = contact.diameter
-                contact.overlaps[0] = 0
-            return False
-        room[2] = coming[0] + min(max(SKIN[0], STEPS_AHEAD * coming[0]), SKIN[1])
-        near[0] = near_pairs(contact, points, 1.2, room[2])  # a segment may be stretched by 20 %
-        room[:2] = -1.0
-    return bool(near[0] > 0)
+        _look_around(contact, points, coming)
+    return bool(contact.near[0] > 0)

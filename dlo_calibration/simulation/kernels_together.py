@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 from dlo_calibration.simulation import entries
-from dlo_calibration.simulation.compilation import entry, part
+from dlo_calibration.simulation.compilation import entry, inlined, part
 from dlo_calibration.simulation.kernels import let_follow, rest_on_table, rod_velocities
 from dlo_calibration.simulation.kernels_contact import keep_apart
 from dlo_calibration.simulation.kernels_frame import turn_clamps
@@ -54,7 +54,7 @@ def _copy_rows_out(lanes: Cube, lane: int, numbers: Matrix) -> None:
             numbers[i, k] = lanes[i, k, lane]
 
 
-@part
+@inlined
 def _aim(move: Move, points: Cube, lane: int, step: float) -> None:
     """Write the velocities of a DLO's held nodes in the next step."""
     k = min(move.progress[0], len(move.targets) - 1)
@@ -63,7 +63,7 @@ def _aim(move: Move, points: Cube, lane: int, step: float) -> None:
             move.follow[h, c] = (move.targets[k, h, c] - points[move.held[h], c, lane]) / step
 
 
-@part
+@inlined
 def _follow_through(move: Move, together: Together, lane: int) -> None:
     """Turn a DLO's clamps with their hands, and let it not pass through itself in the coming step."""
     contact, points, predicted, support = move.contact, together.one[0], together.one[1], together.one[2]
@@ -81,7 +81,7 @@ def _follow_through(move: Move, together: Together, lane: int) -> None:
         _copy_rows_in(together.predicted, lane, predicted)
 
 
-@part
+@inlined
 def _arrive(move: Move, together: Together, lane: int) -> bool:
     """Put a DLO's held nodes where their hands are, and count the step; tell whether its move ended."""
     progress, points = move.progress, together.points
