@@ -31,8 +31,8 @@ class RandomSearch:
         self._generator = np.random.default_rng(seed)
 
     def ask(self, limit: int) -> Floats:
-        """Return the next (m, d) points, at most 32, of one random sequence that does not depend on m."""
-        return self._generator.random((min(limit, 32), self._dimension))  # a multiple of 2, 4, ... workers
+        """Return the next (m, d) points, at most 96, of one random sequence that does not depend on m."""
+        return self._generator.random((min(limit, 96), self._dimension))
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Remember the best point; later points do not depend on it."""
