@@ -11,6 +11,7 @@ import tempfile
 from typing import Any, Iterable, Mapping
 
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.input_messages import DEFINITIONS, input_types
 from dlo_calibration.files.intake import Intake, LimitExceeded, Record, require_file
 from dlo_calibration.files.mcap_file import McapFile
 from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, typestore
@@ -32,7 +33,8 @@ def decode(record: Record) -> Any:
     :raises InputError: where the bytes are not a message of that type.
     """
     try:
-        return typestore().deserialize_cdr(record.data, record.type)
+        types = input_types() if record.type in DEFINITIONS else typestore()
+        return types.deserialize_cdr(record.data, record.type)
     except Exception as error:  # damaged bytes can raise anything
         raise InputError(
             f'{record.name} recorded at {record.log_time / 1e9:.3f} s',
