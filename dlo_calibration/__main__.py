@@ -3,6 +3,7 @@
 
 """The executable `dlo-calibration`, which handles signals before it loads anything large."""
 
+import gc
 import os
 import sys
 
@@ -43,6 +44,7 @@ def main() -> int:
         return 2
     finally:
         StopFlag().ignore()  # what there was to do is done
+        gc.freeze()  # else Python looks for garbage among all objects before it ends, for a tenth of a second
 
 
 if __name__ == '__main__':

@@ -16,6 +16,7 @@ from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation import engine
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.kernel_cache import compile_kernels, TOGETHER
 from dlo_calibration.simulation.protocol import simulate_all
@@ -119,6 +120,15 @@ def test_what_was_simulated_before_makes_no_difference():
             assert [str(one) for one in new] == [str(found)] if isinstance(found, SimulationError) else (
                 new[0].chains.tobytes() == found.chains.tobytes())
         jobs.reverse()
+
+
+@pytest.mark.parametrize('rows', [0, 500])
+def test_scripts_that_are_too_long_to_keep_are_written_again(rows, monkeypatch):
+    jobs = [(trial, physical) for physical in drawn(CABLES, 2) for trial in (carried(0.1, 0.2), turned(1.0))]
+    expected = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
+    monkeypatch.setattr(engine, 'MOST_ROWS', rows)
+    found = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
+    assert [one.chains.tobytes() for one in found] == [one.chains.tobytes() for one in expected]
 
 
 def test_whoever_asks_can_end_it():
