@@ -58,7 +58,7 @@ class Packed:
 
     @property
     def state(self) -> Any:
-        """The state, with values of others that are packed."""
+        """The state; what is nested in it may be `Packed`, too."""
         return self.kind(**self._fields)
 
     def __getitem__(self, name: str) -> Any:
