@@ -14,6 +14,7 @@ from dlo_calibration.model.parameters import knot_names, ParameterSpace
 from dlo_calibration.simulation import entries, rope
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
+from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.kernel_cache import compile_kernels, KERNELS
 
 NODES = (12, 30, 60, 120)
@@ -73,7 +74,8 @@ def tables():
 @pytest.mark.parametrize('nodes', NODES)
 def test_settled_rounds(benchmark, nodes, tables):
     trials, physical = object1()
-    engines = {'bullet': BulletSimulator(nodes=nodes), 'compiled': CompiledSimulator(nodes=nodes)}
+    engines: dict[str, Engine] = {
+        'bullet': BulletSimulator(nodes=nodes), 'compiled': CompiledSimulator(nodes=nodes)}
     steps = {name: sum(engine.simulate(trial, physical).steps for trial in trials)
              for name, engine in engines.items()}
     seconds = side_by_side(benchmark, {
@@ -89,7 +91,7 @@ def test_settled_rounds(benchmark, nodes, tables):
 @pytest.mark.parametrize('number', range(len(ACTIONS)), ids=ACTIONS)
 def test_trial(benchmark, number, tables):
     trials, physical = object1()
-    engines = {'bullet': BulletSimulator(), 'compiled': CompiledSimulator()}
+    engines: dict[str, Engine] = {'bullet': BulletSimulator(), 'compiled': CompiledSimulator()}
     steps = {name: engine.simulate(trials[number], physical).steps for name, engine in engines.items()}
     seconds = side_by_side(benchmark, {
         name: lambda engine=engine: engine.simulate(trials[number], physical)

@@ -113,3 +113,20 @@ def test_fit(benchmark, rows, tmp_path):
     benchmark.pedantic(lambda: times.append(fit(tmp_path / f'{len(times)}')), rounds=ROUNDS, warmup_rounds=1)
     for name, seconds in zip(FIT, zip(*times[1:], strict=True), strict=True):
         rows.append([f'dlo-calibration fit SESSION, {name}', f'{min(seconds):.2f}', ''])
+
+
+def test_random_search(benchmark, rows):
+    words, times = '--search random --evaluations 600', []
+
+    def take():
+        begun = time.perf_counter()
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'dlo_calibration', 'fit', str(SAMPLES / 'object1'), *words.split()],
+            env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        process.stdout.readline()
+        times.append(time.perf_counter() - begun)
+        process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0
+
+    benchmark.pedantic(take, rounds=ROUNDS, warmup_rounds=1)
+    rows.append([f'dlo-calibration fit SESSION {words}, result printed', f'{min(times[1:]):.2f}', ''])

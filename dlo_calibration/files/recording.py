@@ -20,6 +20,7 @@ from textwrap import indent
 import time
 from typing import Any, BinaryIO, cast, Mapping
 
+import mcap  # noqa: F401  # required; its writer takes long to load, and who only reads needs none
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
@@ -71,7 +72,7 @@ class SessionWriter:
             self.path, self.file, self._stream = _create(Path(path))
         except OSError as error:
             raise RecordingError(f'session {path}: cannot be written: {error}') from error
-        from mcap.writer import CompressionType, Writer  # takes long to load; who reads does without
+        from mcap.writer import CompressionType, Writer
 
         self._writer = cast(Any, Writer(self._stream, compression=CompressionType.ZSTD))  # partly untyped
         try:

@@ -21,7 +21,7 @@ from dlo_calibration.simulation.script_writer import write_script
 MOST_KNOWN = 1000  # trials whose nodes are kept; a plan simulates each of its trials only once
 MOST_ROWS = 200_000  # of all scripts that are kept: 100 MB if hands hold four nodes
 
-AnyRope = TypeVar('AnyRope', bound=Stepper)
+AnyRope = TypeVar('AnyRope', bound=Stepper, covariant=True)
 
 
 class Engine(Generic[AnyRope]):
