@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.action import Hand
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.hand_steps import hand_steps
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.script import Advance, Close, Event, Held, Hold, Script, See, Settling, Trace
 
@@ -158,7 +157,7 @@ class _Writer:
             if count > MOST_STEPS:
                 raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
                                       f'more than {MOST_STEPS}; divide its path into several actions')
-            positions, rotations, turns = hand_steps(hand, self._time, self._step, count)
+            positions, rotations, turns = _hand_steps(hand, self._time, self._step, count)
             rows = slice(self.places, self.places + len(nodes))
             self.places = rows.stop
             self.events.append(Close(rows, list(nodes), positions[0]))
@@ -230,3 +229,18 @@ def _rows(array: Floats, first: int, count: int) -> Floats:
     found = array[first:first + count]
     rest = count - len(found)
     return np.concatenate([found, np.repeat(array[-1:], rest, axis=0)]) if rest else found
+
+
+def _hand_steps(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats | None, Floats]:
+    """
+    Return positions and rotations of a hand.
+
+    :param start: time [s] in the trial.
+    :param step: [s].
+    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 3, 3) rotations until then,
+        or None if it does not turn; (count + 1, 9) rotations in each step, row by row, and at last none.
+    """
+    positions, turns = hand.poses(start + step * np.arange(count + 1))
+    each = np.concatenate([turns[1:] @ turns[:-1].transpose(0, 2, 1), np.eye(3)[None]]).reshape(-1, 9)
+    turned = frozen_array(turns @ turns[0].T)
+    return frozen_array(positions), None if np.all(turned == np.eye(3)) else turned, frozen_array(each)
