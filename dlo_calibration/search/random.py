@@ -13,6 +13,8 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
+AT_MOST = 300  # points of one batch: processes wait at its end, and its residuals are in memory until then
+
 
 class RandomSearch:
     """
@@ -31,8 +33,8 @@ class RandomSearch:
         self._generator = np.random.default_rng(seed)
 
     def ask(self, limit: int) -> Floats:
-        """Return the next (m, d) points, at most 96, of one random sequence that does not depend on m."""
-        return self._generator.random((min(limit, 96), self._dimension))
+        """Return the next (m, d) points, m <= AT_MOST, of one random sequence that does not depend on m."""
+        return self._generator.random((min(limit, AT_MOST), self._dimension))
 
     def tell(self, observations: Sequence[Observation]) -> None:
         """Remember the best point; later points do not depend on it."""

@@ -65,14 +65,13 @@ class CompiledRope(Rope):
                 **fields, inverse_masses=rod.inverse_masses, contact=self.contact,
                 progress=np.zeros(4, np.int64), seen=np.empty((CHECKS + 1, *self.state.points.shape))))
         else:
-            move = self._move
-            move.set(**{name: value for name, value in fields.items() if move[name] is not value})
+            self._move.set(**fields)
         return self._move
 
-    def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+    def become(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
               features: Floats | None = None, directions: Floats | None = None) -> None:
         """Become another DLO of as many nodes at the start of a trial; see the constructor."""
-        super().begin(places, points, velocities, physical, features, directions)
+        super().become(places, points, velocities, physical, features, directions)
         if self._move is not None:
             self._move.set(contact=self.contact)
 
@@ -149,7 +148,7 @@ class CompiledSimulator(Engine[CompiledRope]):
             return CompiledRope(layout.places, points, layout.velocities, physical, self._time_step, level,
                                 layout.features, layout.directions)
         rope = self._free.pop()
-        rope.begin(layout.places, points, layout.velocities, physical, layout.features, layout.directions)
+        rope.become(layout.places, points, layout.velocities, physical, layout.features, layout.directions)
         rope.put_on(level)
         return rope
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from typing import Any, Generic, Mapping, Self, TypeVar
 
 from dlo_calibration.model.chain import Floats
@@ -18,10 +19,26 @@ from dlo_calibration.simulation.rollout import roll_out, Stepper
 from dlo_calibration.simulation.script import Script, Settling
 from dlo_calibration.simulation.script_writer import write_script
 
-MOST_KNOWN = 1000  # trials whose nodes are kept; a plan simulates each of its trials only once
-MOST_ROWS = 200_000  # of all scripts that are kept: 100 MB if hands hold four nodes
+MOST_KNOWN = 1000  # trials that are kept; a plan simulates each of its trials only once
+MOST_POSITIONS = 200_000  # of hands in the scripts that are kept: 100 MB if each hand holds four nodes
 
 AnyRope = TypeVar('AnyRope', bound=Stepper, covariant=True)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """
+    What of a trial does not depend on the parameters.
+
+    :param level: height [m] of nodes on the table; None if it is unknown, or if there is no table.
+    :param points: (N, 3) [m] where nodes start.
+    """
+
+    trial: Trial
+    layout: NodeLayout
+    level: float | None
+    points: Floats
+    script: Script
 
 
 class Engine(Generic[AnyRope]):
@@ -49,8 +66,7 @@ class Engine(Generic[AnyRope]):
         self._nodes = nodes
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
-        self._known: dict[int, tuple[Trial, NodeLayout, float | None, Floats]] = {}
-        self._scripts: dict[int, tuple[Trial, Script]] = {}
+        self._kept: dict[int, _Known] = {}  # by the identities of the trials
 
     def prepare(self) -> None:
         """See to it that the kernels are compiled."""
@@ -67,38 +83,34 @@ class Engine(Generic[AnyRope]):
 
     def _start(self, trial: Trial, physical: Mapping[str, float]) -> tuple[Script, AnyRope]:
         """Return the script of a trial, and a rope at the start of it."""
-        layout, level, points = self._layout(trial)
+        known = self._known(trial)
+        level, points = known.level, known.points
         if self._table_height is not None and level is None:
             level = self._table_height + physical['self_collision']
             points = rest_on(points, level)
-        return self._script(trial, layout), self._rope(layout, points, physical, level)
+        return known.script, self._rope(known.layout, points, physical, level)
 
-    def _script(self, trial: Trial, layout: NodeLayout) -> Script:
-        if id(trial) not in self._scripts or self._scripts[id(trial)][0] is not trial:
-            script = write_script(trial, layout, self._time_step, self._settling)
-            self._scripts.pop(id(trial), None)
-            left = MOST_ROWS - script.rows
-            while self._scripts and sum(one.rows for _, one in self._scripts.values()) > left:
-                self._scripts.pop(next(iter(self._scripts)))
-            if left < 0:
-                return script
-            self._scripts[id(trial)] = trial, script
-        return self._scripts[id(trial)][1]
-
-    def _layout(self, trial: Trial) -> tuple[NodeLayout, float | None, Floats]:
-        """
-        Return the nodes of a trial, the height [m] of nodes on the table, and (N, 3) [m] where nodes start.
-
-        The height is None if it is unknown, or if there is no table.
-        """
-        if id(trial) not in self._known or self._known[id(trial)][0] is not trial:
-            while len(self._known) >= MOST_KNOWN:
-                self._known.pop(next(iter(self._known)))
+    def _known(self, trial: Trial) -> _Known:
+        known = self._kept.get(id(trial))
+        if known is None or known.trial is not trial:
             level = None if self._table_height is None else resting_level(trial, self._table_height)
             layout = NodeLayout.of(trial, self._nodes)
             points = layout.points if level is None else rest_on(layout.points, level)
-            self._known[id(trial)] = trial, layout, level, points
-        return self._known[id(trial)][1:]
+            script = write_script(trial, layout, self._time_step, self._settling)
+            known = _Known(trial, layout, level, points, script)
+            self._keep(known)
+        return known
+
+    def _keep(self, known: _Known) -> None:
+        """Keep what is known of a trial, and drop what has been known longest if that is too much."""
+        kept, positions = self._kept, known.script.positions
+        kept.pop(id(known.trial), None)
+        if positions > MOST_POSITIONS:
+            return
+        while len(kept) >= MOST_KNOWN or (
+                positions + sum(one.script.positions for one in kept.values()) > MOST_POSITIONS):
+            del kept[next(iter(kept))]
+        kept[id(known.trial)] = known
 
     def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
               level: float | None) -> AnyRope:
@@ -118,9 +130,8 @@ class Engine(Generic[AnyRope]):
 
     def close(self) -> None:
         """Drop what is known of the trials."""
-        self._known.clear()
-        self._scripts.clear()
+        self._kept.clear()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what belongs to this process."""
-        return {**self.__dict__, '_known': {}, '_scripts': {}}
+        return {**self.__dict__, '_kept': {}}

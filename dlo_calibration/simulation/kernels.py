@@ -40,8 +40,8 @@ def _solve(bands: Matrix, right: Vector) -> bool:
     """
     Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 
-    Each column is finished at once from the six before it: what waits for the last pivot never waits for
-    the memory.
+    Each column is finished at once from the six before it.  The last one stays in registers, so that nothing
+    that the next pivot waits for comes from memory.
 
     :param bands: (6 + m, 7) columns of the lower triangle after six of zeros; becomes 1 / D and L D.
     :param right: (m,) right side; becomes the solution.
@@ -147,26 +147,21 @@ def _let_follow_in(predicted: Matrix, held: Indices, follow: Matrix) -> Any:
 
 
 @part
-def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> bool:
+def _find_springs(points: Matrix, rest_lengths: Vector, stiffness: Vector, implicit: float, step: float,
+                  segments: Matrix, springs: Matrix) -> None:
     """
-    Write to `predicted` the (N, 3) velocities [m/s] after a step of the internal forces; see `rod`.
+    Find what the springs of all segments do; roots and divisions take long, but not if there are many.
 
-    :returns: False if the rollout diverges.
+    :param segments: (N - 1, 7) of `FrameState`: gets unit tangents and inverse lengths; or empty.
+    :param springs: (N, 3) workspace: gets stiffness across and along the segment behind each node [kg], and
+        its impulse [kg/s].
     """
-    rest, stiffness, masses, bending = rod.rest_lengths, rod.stiffness, rod.masses, rod.bending
-    held, follow, bands, right = rod.held, rod.follow, rod.bands[BAND - 1:], rod.right
-    drag, implicit, step = rod.drag, rod.implicit, rod.step
-    n = len(points)
-    framed, segments = len(rod.frame.angles) > 0, rod.frame.segments
-    rubs, pull = len(rod.friction.rows) > 0, rod.friction.pull
-    if rubs:
-        rub(rod.friction, points, step)
-    springs = predicted  # workspace: across and along the segment behind each node [kg], and impulse [kg/s]
-    for i in range(n - 1):  # by themselves: roots and divisions take long, but not if there are many
+    n, framed = len(points), len(segments) > 0
+    for i in range(n - 1):
         here, there = points[i], points[i + 1]
         x, y, z = there[0] - here[0], there[1] - here[1], there[2] - here[2]
         inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
-        slack = 1.0 - rest[i] * inverse
+        slack = 1.0 - rest_lengths[i] * inverse
         across = max(slack, 0.0) * stiffness[i]
         springs[i, 0], springs[i, 2] = across * implicit, stiffness[i] * slack * step
         springs[i, 1] = implicit * (stiffness[i] - across) * inverse * inverse
@@ -175,6 +170,20 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
             segments[i, 3] = inverse
     for c in range(3):
         springs[n - 1, c] = 0.0
+
+
+@part
+def _assemble(points: Matrix, velocities: Matrix, springs: Matrix, masses: Vector, bending: Matrix,
+              drag: float, implicit: float, step: float, pull: Matrix, bands: Matrix, right: Vector) -> None:
+    """
+    Write the equations of a step, without frame and held nodes.
+
+    :param springs: see `_find_springs`.
+    :param pull: (N, 6) of `SlipState`; or empty.
+    :param bands: (3 N, 7) gets the columns of the lower triangle.
+    :param right: (3 N,) gets the right side.
+    """
+    n, rubs = len(points), len(pull) > 0
     # What the segment before a node adds to its equations, then what the one behind it does.
     xx, yy, zz, xy, xz, yz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
@@ -212,14 +221,29 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
         two[0], two[1], two[2], two[3], two[4], two[5] = ay + yy, byz + yz, -xy, first - yy, -yz, 0.0
         three[0], three[1], three[2], three[3], three[4], three[5] = az + zz, -xz, -yz, first - zz, 0.0, 0.0
         one[6], two[6], three[6] = second, second, second
-    if framed:
+
+
+@inlined
+def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> bool:
+    """
+    Write to `predicted` the (N, 3) velocities [m/s] after a step of the internal forces; see `rod`.
+
+    :returns: False if the rollout diverges.
+    """
+    right, step = rod.right, rod.step
+    if len(rod.friction.rows) > 0:
+        rub(rod.friction, points, step)
+    _find_springs(points, rod.rest_lengths, rod.stiffness, rod.implicit, step, rod.frame.segments, predicted)
+    _assemble(points, velocities, predicted, rod.masses, rod.bending, rod.drag, rod.implicit, step,
+              rod.friction.pull, rod.bands[BAND - 1:], right)
+    if len(rod.frame.angles) > 0:
         add_frame(rod.frame, step, right)
-    _hold(bands, right, masses, held, follow)
+    _hold(rod.bands[BAND - 1:], right, rod.masses, rod.held, rod.follow)
     solved = _solve(rod.bands, right)
-    for i in range(n):
+    for i in range(len(points)):
         for c in range(3):
             predicted[i, c] = right[3 * i + c]
-    let_follow(predicted, held, follow)
+    let_follow(predicted, rod.held, rod.follow)
     return solved
 
 
@@ -244,8 +268,8 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
             vx, vy = velocities[i, 0], velocities[i, 1]
             speed = math.sqrt(vx * vx + vy * vy)
             share = where(speed > 0.0, 1.0 - min(1.0, friction * push / speed), 0.0)
-            velocities[i, 0] = where(touches, share * vx, vx)
-            velocities[i, 1] = where(touches, share * vy, vy)
+            share = where(touches, share, 1.0)  # and not the products: a masked store takes long
+            velocities[i, 0], velocities[i, 1] = share * vx, share * vy
             velocities[i, 2] = where(touches, least, velocities[i, 2])
 
 

@@ -22,19 +22,22 @@ import json
 from pathlib import Path
 import struct
 import threading
-from typing import Any, Callable, Iterable, NamedTuple, Sequence
+from typing import Any, Callable, Iterable, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
 from dlo_calibration.simulation.kernel_cache import compile_kernels, is_compiled
 from dlo_calibration.simulation.states import LAYOUTS
 
-_start, _address, _octets = ctypes.c_char.from_buffer, ctypes.addressof, struct.pack
+_start, _address = ctypes.c_char.from_buffer, ctypes.addressof
+_write_number = struct.Struct('d').pack_into
+_write_array = [struct.Struct(f'{1 + axes}q').pack_into for axes in range(4)]  # address and shape
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
 _LIBRARY = ctypes.CDLL(None)  # the process, with the libraries of C and Python
 #: Numba's functions that raise what a kernel raised; ours raise nothing
 _RAISING = {'numba_do_raise', 'numba_gil_ensure', 'numba_gil_release', 'numba_runtime_build_excinfo_struct',
             'numba_unpickle'}
+_Place = tuple[int, Any]  # of a field: its first word, and its layout
 _LOCK = threading.RLock()
 _KERNELS: dict[str, list[Kernel]] = {}  # by the module in which they are defined
 _ENGINES: list[Any] = []  # they own the functions
@@ -50,11 +53,10 @@ class Packed:
     __slots__ = ('_fields', 'kind', 'words')
 
     def __init__(self, state: Any) -> None:
-        kind: type = type(state)
-        self.kind = kind
-        self._fields: dict[str, Any] = state._asdict()
-        self.words = array('q')
-        _add(self.words, state, fields_of(kind))
+        self.kind: type = type(state)
+        self.words = _room(_size(self.kind))
+        self._fields: dict[str, Any] = {}
+        self.set(**state._asdict())
 
     @property
     def state(self) -> Any:
@@ -71,16 +73,12 @@ class Packed:
 
         :raises TypeError: if an array is not what the state's annotations tell.
         """
-        places, words = _places(self.kind), self.words
+        places, fields = _places_of(self.kind), self._fields
         for name, value in values.items():
-            layout, start, end = places[name]
-            if layout is int:
-                words[start] = value
-            else:
-                new = array('q')
-                _add(new, (value,), ((name, layout),))
-                words[start:end] = new
-        self._fields.update(values)
+            if value is not fields.get(name) or type(value) is Packed:
+                start, layout = places[name]
+                _write(self.words, start, name, value, layout)
+        fields.update(values)
 
 
 class Kernel:
@@ -98,6 +96,8 @@ class Kernel:
         del words['return']
         self.name = declared.__name__
         self.fields = tuple((name, LAYOUTS[word]) for name, word in words.items())
+        self._places = _places(self.fields)
+        self._size = sum(_size(layout) for _, layout in self.fields)
         self.module = module
         self._function: Callable[[int], int] = self._load
 
@@ -107,8 +107,8 @@ class Kernel:
 
         :raises TypeError: if an array is not what the annotations tell.
         """
-        words = array('q')
-        _add(words, values, self.fields)
+        words = _room(self._size)
+        _write_all(words, 0, values, self._places)
         return self._function(words.buffer_info()[0])
 
     @property
@@ -217,48 +217,67 @@ def _add_symbol(llvm: Any, name: str) -> None:
             raise ValueError(f'a kernel calls {one}, which only Numba has')
 
 
-def _add(words: array[int], values: Iterable[Any], fields: Iterable[tuple[str, Any]]) -> None:
-    """Add the words of values, one after the other; `fields` are their names and layouts."""
-    for value, (name, layout) in zip(values, fields, strict=True):
-        kind: Any = type(value)
-        if kind is np.ndarray and type(layout) is tuple:
-            if (value.dtype, value.ndim) != layout or not value.flags.carray:
-                raise TypeError(f'{name} is an array of {value.dtype} with {value.ndim} axes; a kernel takes '
-                                f'one of {layout[0]} with {layout[1]}, in one piece and not read-only')
-            words.append(_address(_start(value)) if value.size else 0)
-            words.extend(value.shape)
-        elif kind is Packed and value.kind is layout:
-            words.extend(value.words)
-        elif layout is int:
-            words.append(int(value))
-        elif layout is float:
-            words.frombytes(_octets('d', value))
-        elif type(layout) is list:
-            _add(words, value, [(name, one) for one in layout])
-        elif kind is layout:
-            _add(words, value, fields_of(layout))
-        else:
-            raise TypeError(f'{name} is of {kind.__name__}; a kernel takes {layout}')
+def _room(size: int) -> array[int]:
+    """Return as many words, which are not known yet."""
+    return array('q', bytes(8 * size))
+
+
+def _write_all(words: array[int], start: int, values: Iterable[Any], places: Mapping[str, _Place]) -> None:
+    """Write the words of values one after the other, from a word on."""
+    for value, (name, (place, layout)) in zip(values, places.items(), strict=True):
+        _write(words, start + place, name, value, layout)
+
+
+def _write(words: array[int], start: int, name: str, value: Any, layout: Any) -> None:
+    """Write the words of a value to a place."""
+    kind: Any = type(value)
+    if kind is np.ndarray and type(layout) is tuple:
+        if (value.dtype, value.ndim) != layout or not value.flags.carray:
+            raise TypeError(f'{name} is an array of {value.dtype} with {value.ndim} axes; a kernel takes '
+                            f'one of {layout[0]} with {layout[1]}, in one piece and not read-only')
+        _write_array[value.ndim](
+            words, 8 * start, _address(_start(value)) if value.size else 0, *value.shape)
+    elif kind is Packed and value.kind is layout:
+        words[start:start + len(value.words)] = value.words
+    elif layout is int:
+        words[start] = int(value)
+    elif layout is float:
+        _write_number(words, 8 * start, value)
+    elif type(layout) is list:
+        for k, (one, state) in enumerate(zip(value, layout, strict=True)):
+            _write(words, start + k * _size_of(state), name, one, state)
+    elif kind is layout:
+        _write_all(words, start, value, _places_of(layout))
+    else:
+        raise TypeError(f'{name} is of {kind.__name__}; a kernel takes {layout}')
+
+
+def _places(fields: Iterable[tuple[str, Any]]) -> dict[str, _Place]:
+    """Return where the words of each field begin, and its layout, by name."""
+    found, start = {}, 0
+    for name, layout in fields:
+        found[name] = start, layout
+        start += _size(layout)
+    return found
 
 
 @cache
-def _places(state: type) -> dict[str, tuple[Any, int, int]]:
-    """Return layouts of the fields of a state, and where their words begin and end, by name."""
-    found, start = {}, 0
-    for name, layout in fields_of(state):
-        end = start + _size(layout)
-        found[name] = layout, start, end
-        start = end
-    return found
+def _places_of(state: type) -> dict[str, _Place]:
+    return _places(fields_of(state))
 
 
 def _size(layout: Any) -> int:
     """Return the number of words of a value."""
     if isinstance(layout, list):
         return sum(map(_size, layout))
-    if layout in (int, float):
-        return 1
-    return 1 + layout[1] if isinstance(layout, tuple) else sum(_size(one) for _, one in fields_of(layout))
+    if isinstance(layout, tuple):
+        return 1 + int(layout[1])
+    return 1 if layout in (int, float) else _size_of(layout)
+
+
+@cache
+def _size_of(state: type) -> int:
+    return sum(_size(layout) for _, layout in fields_of(state))
 
 
 @cache

@@ -128,16 +128,15 @@ class Rod:
     def __init__(self, rest_lengths: Floats, properties: RodProperties, time_step: float,
                  features: Floats | None = None) -> None:
         n = len(rest_lengths) + 1
-        self._places: dict[tuple[int, ...], tuple[NDArray[np.int64], Floats]] = {}  # of held nodes
         self.state = RodState(
             rest_lengths=np.empty(n - 1), stiffness=np.empty(n - 1), masses=np.empty(n),
             inverse_masses=np.empty(n), bending=np.empty((3, n)), frame=_no_frame(), friction=_no_friction(),
             held=np.zeros(0, np.int64), follow=np.zeros((0, 3)), drag=0.0, implicit=0.0,
             step=float(time_step), bands=np.zeros((BAND - 1 + 3 * n, BAND)),
             right=np.empty(3 * n))
-        self.begin(rest_lengths, properties, features)
+        self.become(rest_lengths, properties, features)
 
-    def begin(self, rest_lengths: Floats, properties: RodProperties, features: Floats | None = None) -> None:
+    def become(self, rest_lengths: Floats, properties: RodProperties, features: Floats | None = None) -> None:
         """Become another chain of as many nodes; see the constructor."""
         state = self.state
         np.multiply(rest_lengths, properties.length_scale, out=state.rest_lengths)
@@ -170,13 +169,9 @@ class Rod:
         if tuple(nodes) == self._held:
             return
         self._held = tuple(nodes)
-        rigid, cells, weights, bands = _cells(self._lengths, self._held)
-        if self._held not in self._places:
-            self._places[self._held] = np.array(self._held, np.int64), np.empty((len(self._held), 3))
-        held, follow = self._places[self._held]
+        held, rigid, cells, weights, bands = _cells(self._lengths, self._held)
         np.divide(1.0, state.masses, out=state.inverse_masses)
         state.inverse_masses[held] = 0.0
-        follow[:] = 0.0
         frame, friction = state.frame, state.friction
         if self._uniform:
             np.multiply(self._properties.bending_stiffness, bands, out=state.bending)
@@ -188,7 +183,7 @@ class Rod:
             if not self._uniform:
                 state.bending[...] = _bending_bands(self._rows, joints)
         self.state = state._replace(
-            held=held, follow=follow, frame=frame, friction=friction)
+            held=held, follow=np.zeros((len(held), 3)), frame=frame, friction=friction)
 
     @property
     def _framed(self) -> bool:
@@ -311,23 +306,23 @@ def _rows_and_weights(lengths: bytes) -> tuple[Floats, Floats, float]:
 
 @lru_cache(maxsize=256)
 def _cells(lengths: bytes, held: tuple[int, ...]
-           ) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:
+           ) -> tuple[NDArray[np.int64], NDArray[np.bool_], Floats, Floats, Floats]:
     """
     Return what depends on the rest lengths and on the held nodes.
 
-    :returns: (N - 1,) which segments are rigid; (N - 2,) [m] the length that
-        bends at each inner node; (N - 2,) [1/m] its inverse, 0 where nothing bends; and the bending matrix
-        of a DLO whose bending stiffness is 1 N m^2, see `_bending_bands`.
+    :returns: (h,) the nodes, as kernels take them; (N - 1,) which segments are rigid; (N - 2,) [m] the
+        length that bends at each inner node; (N - 2,) [1/m] its inverse, 0 where nothing bends; and the
+        bending matrix of a DLO whose bending stiffness is 1 N m^2, see `_bending_bands`.
     """
     rest_lengths = np.frombuffer(lengths)
-    follows = np.zeros(len(rest_lengths) + 1, bool)
-    follows[list(held)] = True
+    nodes, follows = np.array(held, np.int64), np.zeros(len(rest_lengths) + 1, bool)
+    follows[nodes] = True
     rigid = follows[:-1] & follows[1:]
     bendable = np.where(rigid, 0.0, rest_lengths)
     cells = (bendable[:-1] + bendable[1:]) / 2
     weights = np.divide(1.0, cells, out=np.zeros_like(cells), where=cells > 0)
     bands = _bending_bands(_rows_and_weights(lengths)[0], weights)
-    return rigid, frozen_array(cells), frozen_array(weights), frozen_array(bands)
+    return nodes, rigid, frozen_array(cells), frozen_array(weights), frozen_array(bands)
 
 
 def _bending_bands(rows: Floats, joints: Floats) -> Floats:

@@ -101,7 +101,7 @@ def roll_out(script: Script, stepper: Stepper) -> Rollout:
 
 def course(script: Script, stepper: Stepper) -> Course:
     """Return the course of a trial for a stepper that is at the start of it; others take its steps."""
-    places = np.empty((script.places, 3))  # [m] of nodes relative to the hands that hold them
+    offsets = np.empty((script.offsets, 3))  # [m] of nodes from the hands that hold them
     before, chains, settled = stepper.points, [], []
     steps, rests = 0, False  # whether the DLO came to rest and nothing has happened since
     for event in script.events:
@@ -109,13 +109,13 @@ def course(script: Script, stepper: Stepper) -> Course:
             if event.remembers:
                 before = stepper.points
             if not (event.settles and rests):
-                taken, rests = _answered((yield _steps(event, script, stepper, places)))
+                taken, rests = _answered((yield _steps(event, script, stepper, offsets)))
                 steps += taken
         elif isinstance(event, Hold):
             stepper.hold(event.nodes)
             rests = False
         elif isinstance(event, Close):
-            places[event.rows] = stepper.points[event.nodes] - event.position
+            offsets[event.rows] = stepper.points[event.nodes] - event.position
         elif isinstance(event, See):
             now = stepper.points
             chains.append(script.observe @ (
@@ -124,7 +124,7 @@ def course(script: Script, stepper: Stepper) -> Course:
         else:
             path = np.empty((event.steps.count + 2, *before.shape))
             path[:2] = before, stepper.points
-            taken, rests = _answered((yield _steps(event.steps, script, stepper, places, path[2:])))
+            taken, rests = _answered((yield _steps(event.steps, script, stepper, offsets, path[2:])))
             steps += taken
             before, earlier = path[-2], path[event.after - 1]
             chains.extend(script.observe @ (
@@ -133,9 +133,9 @@ def course(script: Script, stepper: Stepper) -> Course:
     return Rollout(np.array(chains), tuple(settled), steps * script.time_step, steps)
 
 
-def _steps(event: Advance, script: Script, stepper: Stepper, places: Floats,
+def _steps(event: Advance, script: Script, stepper: Stepper, offsets: Floats,
            path: Floats | None = None) -> Steps:
-    return Steps(event.targets(places), event.turns if stepper.twists else None, event.count, path,
+    return Steps(event.targets(offsets), event.turns if stepper.twists else None, event.count, path,
                  script.settling if event.settles else None)
 
 

@@ -39,9 +39,9 @@ class Rope:
     def __init__(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
                  time_step: float, gravity: Floats, features: Floats | None = None,
                  directions: Floats | None = None) -> None:
-        properties, lengths = RodProperties.of(physical), np.diff(places)
-        self._rod = Rod(lengths, properties, time_step, features)
-        contact = self_contact(self._rod.state.rest_lengths, 0.0, 0.0)
+        properties = RodProperties.of(physical)
+        self._rod = Rod(places[1:] - places[:-1], properties, time_step, features)
+        contact = self_contact(self._rod.state.rest_lengths, 0.0, 0.0)  # `_begin` sets radius and friction
         #: its contact with itself, as kernels take it
         self.contact: Any = Packed(contact)
         points = np.array(points, dtype=float)
@@ -53,11 +53,11 @@ class Rope:
         self._packed: tuple[RopeState, Packed] | None = None
         self._begin(places, properties, physical, directions)
 
-    def begin(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
+    def become(self, places: Floats, points: Floats, velocities: Floats, physical: Mapping[str, float],
               features: Floats | None = None, directions: Floats | None = None) -> None:
         """Become another DLO of as many nodes at the start of a trial; see the constructor."""
         properties = RodProperties.of(physical)
-        self._rod.begin(np.diff(places), properties, features)
+        self._rod.become(places[1:] - places[:-1], properties, features)
         state = self.state
         state.points[...], state.velocities[...] = points, velocities
         state.predicted[...], state.support[...] = 0.0, 0.0

@@ -36,9 +36,9 @@ class Settling:
 @dataclass(frozen=True)
 class Close:
     """
-    A hand closes: its nodes keep their places relative to it from now on.
+    A hand closes: its nodes keep their offsets from it from now on.
 
-    :param rows: their rows of the table of these places.
+    :param rows: of the table of these offsets, one for each node.
     :param nodes: that it grips.
     :param position: (3,) [m] of the hand.
     """
@@ -56,11 +56,11 @@ class Hold:
 
 
 @dataclass(frozen=True)
-class Held:
+class Grip:
     """
     Nodes that a hand holds while steps are taken; after the last of the k rows, it stays.
 
-    :param rows: (n,) rows of the table of places relative to hands, one for each node.
+    :param rows: (n,) of the table of offsets, one for each node.
     :param positions: (k, 3) [m] of the hand after each step.
     :param rotations: (k, 3, 3) of the hand after each step since it closed; None: it does not turn.
     :param turns: (k, 9) rotation matrices of the hand in each step, row by row.
@@ -77,82 +77,80 @@ class Advance:
     """
     Steps are taken.
 
-    :param held: what each closed hand does meanwhile.
+    :param grips: what each closed hand does meanwhile.
     :param count: number of steps; with `settles`, the most.
     :param settles: they end as soon as the DLO is stable; if it is, and nothing has happened since, none is
         taken.
     :param remembers: the points before are kept, see `See`.
     """
 
-    held: tuple[Held, ...]
+    grips: tuple[Grip, ...]
     count: int
     settles: bool = False
     remembers: bool = False
 
-    def targets(self, places: Floats) -> Floats:
+    def targets(self, offsets: Floats) -> Floats:
         """
         Return the positions of the held nodes after each step, (k, h, 3) [m].
 
-        :param places: (p, 3) [m] the table of places of nodes relative to the hands that closed.
+        :param offsets: (p, 3) [m] of nodes from the hands that hold them, when these closed.
         """
-        targets = self._positions + places[self._rows]
+        if not self.grips:
+            return self._positions
+        targets = self._positions + offsets[self._rows]
         start = 0
-        for one in self.held:
-            end = start + len(one.rows)
-            if one.rotations is not None:
-                targets[:, start:end] = one.positions[:, None, :] + np.einsum(
-                    'kij,nj->kni', one.rotations, places[one.rows])
+        for grip in self.grips:
+            end = start + len(grip.rows)
+            if grip.rotations is not None:
+                targets[:, start:end] = grip.positions[:, None, :] + np.einsum(
+                    'kij,nj->kni', grip.rotations, offsets[grip.rows])
             start = end
         return targets
 
     @cached_property
     def _rows(self) -> NDArray[np.int64]:
-        return np.concatenate([np.zeros(0, np.int64), *(one.rows for one in self.held)])
+        return np.concatenate([np.zeros(0, np.int64), *(grip.rows for grip in self.grips)])
 
     @cached_property
     def _positions(self) -> Floats:
         """The (k, h, 3) [m] positions of the hands that hold the nodes; of at least one step."""
-        rows = max((len(one.positions) for one in self.held), default=1)
+        rows = max((len(grip.positions) for grip in self.grips), default=1)
         return np.concatenate([np.zeros((rows, 0, 3)), *(
-            np.repeat(one.positions[:, None], len(one.rows), axis=1) for one in self.held)], axis=1)
+            np.repeat(grip.positions[:, None], len(grip.rows), axis=1) for grip in self.grips)], axis=1)
 
     @cached_property
     def turns(self) -> Floats:
         """The (k, h, 9) rotation matrices of the hands that hold the nodes in each step."""
         return np.concatenate([np.zeros((len(self._positions), 0, 9)), *(
-            np.repeat(one.turns[:, None], len(one.rows), axis=1) for one in self.held)], axis=1)
+            np.repeat(grip.turns[:, None], len(grip.rows), axis=1) for grip in self.grips)], axis=1)
 
 
 @dataclass(frozen=True)
 class See:
     """
-    The DLO is seen at a goal.
+    The DLO is seen at the next goal.
 
-    :param goal: index of the goal.
     :param share: it is seen so far (0 to 1) on the way from the points that were remembered to those now;
         None: now, and the goal is a stable configuration.
     """
 
-    goal: int
     share: float | None
 
 
 @dataclass(frozen=True)
 class Trace:
     """
-    Steps are taken, and the DLO is seen at several timed goals.
+    Steps are taken, and the DLO is seen at the next goals, all of which have a time.
 
     The positions in question are the remembered ones, those before the steps, and those after each step.
     Those before the last step are remembered.
 
     :param steps: that are taken.
-    :param first: index of the first goal.
     :param after: (g,) index of the positions after each goal, at least 1.
     :param shares: (g,) the DLO is seen so far (0 to 1) on the way to them from those before.
     """
 
     steps: Advance
-    first: int
     after: NDArray[np.int64]
     shares: Floats
 
@@ -166,16 +164,16 @@ class Script:
     What happens in a simulated trial.
 
     :param events: in order.
-    :param places: number of rows of the table of places of nodes relative to hands.
-    :param rows: of the positions of hands that it contains.
+    :param offsets: number of rows of the table of offsets of nodes from hands.
+    :param positions: how many positions of hands the events contain; its memory grows with them.
     :param observe: see `NodeLayout`.
     :param settling: when the DLO is stable.
     :param time_step: [s].
     """
 
     events: tuple[Event, ...]
-    places: int
-    rows: int
+    offsets: int
+    positions: int
     observe: Floats
     settling: Settling
     time_step: float

@@ -24,7 +24,7 @@ from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import NodeLayout
-from dlo_calibration.simulation.script import Advance, Close, Event, Held, Hold, Script, See, Settling, Trace
+from dlo_calibration.simulation.script import Advance, Close, Event, Grip, Hold, Script, See, Settling, Trace
 
 MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
 MOST_TRACED = 5000  # steps that are traced at once: all of them are in memory
@@ -39,24 +39,31 @@ def write_script(trial: Trial, layout: NodeLayout, time_step: float, settling: S
     """
     writer = _Writer(trial, layout, time_step, settling)
     writer.write()
-    return Script(tuple(writer.events), writer.places, writer.rows, layout.observe, settling, time_step)
+    return Script(tuple(writer.events), writer.offsets, writer.positions, layout.observe, settling, time_step)
 
 
 @dataclass
-class _Grip:
+class _ClosedHand:
     hand: Hand
     nodes: tuple[int, ...]
     rows: NDArray[np.int64]
-    closed: int  # number of steps when it closed
+    since: int  # number of steps when it closed
     positions: Floats  # (k, 3) [m] of the hand after each later step, until it rests
     rotations: Floats | None  # (k, 3, 3) since it closed
     turns: Floats  # (k + 1, 9) in each of these steps, and none
+
+    def grip(self, steps: int, count: int) -> Grip:
+        """Return what it does after so many steps of the trial."""
+        first = steps - self.since
+        return Grip(self.rows, _rows(self.positions, first, count),
+                    None if self.rotations is None else _rows(self.rotations, first, count),
+                    _rows(self.turns, first, count))
 
 
 class _Writer:
     def __init__(self, trial: Trial, layout: NodeLayout, time_step: float, settling: Settling) -> None:
         self.events: list[Event] = []
-        self.places, self.rows = 0, 0
+        self.offsets, self.positions = 0, 0
         self._trial = trial
         self._layout = layout
         self._step = time_step
@@ -66,7 +73,7 @@ class _Writer:
         self._last = 0.0  # time [s] of the points that are remembered
         self._goal = 0  # index of the current goal
         self._timed = [goal.time for goal in trial.goals if not goal.stable]  # [s], increasing
-        self._grips: dict[str, _Grip] = {}
+        self._closed: dict[str, _ClosedHand] = {}
         self._waiting = list(trial.hands)
 
     def write(self) -> None:
@@ -78,9 +85,9 @@ class _Writer:
                 self._act_until(goal.time)
                 self._open(goal)
                 self._settle(self._settling.limit)  # takes no time of the trial
-                self.events.append(See(k, None))
+                self.events.append(See(None))
             elif k >= seen:
-                self._see(k, goal.time)
+                self._see(goal.time)
                 seen = self._trace(k + 1)
 
     def _goals(self, first: int) -> Iterator[Goal]:
@@ -88,7 +95,12 @@ class _Writer:
         for k in range(first, len(self._trial.goals)):
             yield self._trial.goals[k]
 
-    def _see(self, goal: int, instant: float) -> None:
+    def _hands(self) -> Iterator[Hand]:
+        """Yield the hands that are closed."""
+        for closed in self._closed.values():
+            yield closed.hand
+
+    def _see(self, instant: float) -> None:
         """See the DLO at an instant, between two steps."""
         self._act_until(instant - self._step)
         while self._time < instant - ROUNDING:
@@ -97,7 +109,7 @@ class _Writer:
             self._advance(1, remembers=True)
             self._open_arrived()
         share = (instant - self._last) / (self._time - self._last) if self._time > self._last else 0.0
-        self.events.append(See(goal, min(max(share, 0.0), 1.0)))
+        self.events.append(See(min(max(share, 0.0), 1.0)))
 
     def _trace(self, first: int) -> int:
         """
@@ -108,9 +120,9 @@ class _Writer:
         step = self._step
         self._close()
         events = [hand.start for hand in self._waiting] + [
-            grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+            hand.end for hand in self._hands() if hand.end > self._time + ROUNDING]
         end = min(events, default=math.inf) - 2 * step
-        arrived = [grip.hand for grip in self._grips.values() if grip.hand.end <= self._time + ROUNDING]
+        arrived = [hand for hand in self._hands() if hand.end <= self._time + ROUNDING]
         last = first
         for goal in self._goals(first):
             if goal.stable or goal.time > end or goal.time - self._time > MOST_TRACED * step \
@@ -127,14 +139,14 @@ class _Writer:
         after = np.clip(np.searchsorted(times, instants - ROUNDING), 1, len(times) - 1)
         widths = times[after] - times[after - 1]
         shares = np.clip((instants - times[after - 1]) / np.maximum(widths, ROUNDING), 0.0, 1.0)
-        self.events.append(Trace(steps, first, after, shares))
+        self.events.append(Trace(steps, after, shares))
         return last
 
     def _act_until(self, until: float) -> None:
         """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
         while self._time < until - ROUNDING:
             self._close()
-            ends = [grip.hand.end for grip in self._grips.values() if grip.hand.end > self._time + ROUNDING]
+            ends = [hand.end for hand in self._hands() if hand.end > self._time + ROUNDING]
             starts = [hand.start for hand in self._waiting if hand.start < until]
             target = min([*ends, *starts, until])
             if ends or not self._nothing_timed_before(target):
@@ -158,12 +170,12 @@ class _Writer:
                 raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
                                       f'more than {MOST_STEPS}; divide its path into several actions')
             positions, rotations, turns = _hand_steps(hand, self._time, self._step, count)
-            rows = slice(self.places, self.places + len(nodes))
-            self.places = rows.stop
+            rows = slice(self.offsets, self.offsets + len(nodes))
+            self.offsets = rows.stop
             self.events.append(Close(rows, list(nodes), positions[0]))
-            self._grips.pop(hand.name, None)
+            self._closed.pop(hand.name, None)
             self._let_go(nodes)
-            self._grips[hand.name] = _Grip(
+            self._closed[hand.name] = _ClosedHand(
                 hand, nodes, np.arange(rows.start, rows.stop), self._steps, positions[1:],
                 None if rotations is None else rotations[1:], turns)
         if closing:
@@ -171,34 +183,34 @@ class _Writer:
 
     def _open_arrived(self) -> None:
         """Open the hands that have arrived, unless the next goal shows them closed."""
-        for grip in list(self._grips.values()):
-            if grip.hand.end <= self._time + ROUNDING:
-                end = grip.hand.end
+        for closed in list(self._closed.values()):
+            if closed.hand.end <= self._time + ROUNDING:
+                end = closed.hand.end
                 following = next((goal for goal in self._goals(self._goal) if goal.time > end), None)
-                if following is not None and not self._trial.holds(grip.hand, following):
-                    self._release(grip)
+                if following is not None and not self._trial.holds(closed.hand, following):
+                    self._release(closed)
 
     def _open(self, goal: Goal) -> None:
         """Open the hands that have arrived and that a goal shows open."""
-        for grip in list(self._grips.values()):
-            if grip.hand.end < goal.time and not self._trial.holds(grip.hand, goal):
-                self._release(grip)
+        for closed in list(self._closed.values()):
+            if closed.hand.end < goal.time and not self._trial.holds(closed.hand, goal):
+                self._release(closed)
 
     def _let_go(self, nodes: tuple[int, ...]) -> None:
         """Take nodes from the hands that hold them, because another hand grips them."""
-        for name, grip in list(self._grips.items()):
-            kept = [k for k, node in enumerate(grip.nodes) if node not in nodes]
+        for name, closed in list(self._closed.items()):
+            kept = [k for k, node in enumerate(closed.nodes) if node not in nodes]
             if not kept:
-                del self._grips[name]
-            elif len(kept) < len(grip.nodes):
-                grip.nodes, grip.rows = tuple(grip.nodes[k] for k in kept), grip.rows[kept]
+                del self._closed[name]
+            elif len(kept) < len(closed.nodes):
+                closed.nodes, closed.rows = tuple(closed.nodes[k] for k in kept), closed.rows[kept]
 
-    def _release(self, grip: _Grip) -> None:
-        del self._grips[grip.hand.name]
+    def _release(self, closed: _ClosedHand) -> None:
+        del self._closed[closed.hand.name]
         self._hold()
 
     def _hold(self) -> None:
-        self.events.append(Hold(tuple(node for grip in self._grips.values() for node in grip.nodes)))
+        self.events.append(Hold(tuple(node for closed in self._closed.values() for node in closed.nodes)))
 
     def _advance(self, count: int, remembers: bool = False) -> None:
         self.events.append(self._taken(count, remembers=remembers))
@@ -211,17 +223,14 @@ class _Writer:
 
     def _taken(self, count: int, settles: bool = False, remembers: bool = False) -> Advance:
         """Take steps."""
-        grips = list(self._grips.values())
-        after = [self._steps - grip.closed for grip in grips]
-        moving = max((len(grip.turns) - k for k, grip in zip(after, grips, strict=True)), default=1)
+        hands = self._closed.values()
+        moving = max((len(closed.turns) - (self._steps - closed.since) for closed in hands), default=1)
         moving = min(max(moving, 1), count)
-        held = tuple(Held(grip.rows, _rows(grip.positions, k, moving),
-                          None if grip.rotations is None else _rows(grip.rotations, k, moving),
-                          _rows(grip.turns, k, moving)) for k, grip in zip(after, grips, strict=True))
+        grips = tuple(closed.grip(self._steps, moving) for closed in hands)
         self._time += count * self._step
         self._steps += count
-        self.rows += moving * len(grips)
-        return Advance(held, count, settles, remembers)
+        self.positions += moving * len(hands)
+        return Advance(grips, count, settles, remembers)
 
 
 def _rows(array: Floats, first: int, count: int) -> Floats:

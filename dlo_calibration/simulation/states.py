@@ -207,7 +207,7 @@ class Move(NamedTuple):
     :param most: steps of the move, at most.
     :param periods: (c,) steps between two checks whether the DLO is stable, the last one after `most` steps;
         (0,): it is not checked.
-    :param seen: (c + 1, N, 3) [m] where the nodes were at the last checks.
+    :param seen: (c + 1, N, 3) [m] where the nodes were at the last checks; or more.
     :param distance: [m] it is stable if no node is further from the first of these places.
     :param progress: (4,) steps taken; steps until the next check; checks made; how the move ended: `GOES_ON`,
         `STABLE` or `DIVERGED`.

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 import math
+from operator import attrgetter
 from typing import Callable, Hashable, Iterable, Sequence
 
 import numpy as np
@@ -33,11 +34,16 @@ from dlo_calibration.simulation.states import (
     GOES_ON,
     IMPLICIT,
     LEVEL,
-    RodState,
     RopeState,
     STABLE,
     Together,
 )
+
+# What steps change of a rope's state, and what they do not; the last word is the name in `Together`.
+CHANGING = ('points', 'velocities', 'support', 'rod.frame.angles', 'rod.frame.clamps', 'rod.frame.carried',
+            'rod.frame.joints', 'rod.friction.kept')
+LASTING = ('rod.rest_lengths', 'rod.stiffness', 'rod.masses', 'rod.bending', 'rod.frame.natural',
+           'rod.frame.twisting', 'rod.friction.rows')
 
 
 class Lanes:
@@ -63,13 +69,13 @@ class Lanes:
             lane=np.arange(COUNT), gravity=rope.state.gravity, step=rod.step, clamped=frame.clamped,
             begun=np.ones(1, np.int64), one=np.empty((3, n, 3)))
         self._packed = Packed(self.state)
-        self._changing, self._lasting = self._used(_CHANGING), self._used(_LASTING)
+        self._changing, self._all = self._used(CHANGING), self._used(CHANGING + LASTING)
         self._ropes: list[RolloutUnderWay] = []
 
-    def _used(self, names: Sequence[str]) -> list[tuple[int, Floats]]:
-        """Return the arrays that ropes of this kind have, and their places among `names`."""
-        arrays = [(place, getattr(self.state, name)) for place, name in enumerate(names)]
-        return [(place, array) for place, array in arrays if array.size]
+    def _used(self, names: Sequence[str]) -> tuple[Callable[[RopeState], Sequence[Floats]], list[Floats]]:
+        """Return what finds the arrays that ropes of this kind have, and those of the lanes."""
+        used = [name for name in names if getattr(self.state, name.split('.')[-1]).size]
+        return attrgetter(*used), [getattr(self.state, name.split('.')[-1]) for name in used]
 
     def let_in(self, rollouts: Sequence[RolloutUnderWay]) -> None:
         """Give these, at most `COUNT`, and no others, a lane each."""
@@ -89,16 +95,17 @@ class Lanes:
 
     def let_out(self, one: RolloutUnderWay) -> None:
         """Give a rope its state back."""
-        lane, arrays = self._ropes.index(one), _changing(one.rope.state)
-        for place, lanes in self._changing:
-            arrays[place][...] = lanes[..., lane]
+        find, arrays = self._changing
+        lane = self._ropes.index(one)
+        for own, lanes in zip(find(one.rope.state), arrays, strict=True):
+            own[...] = lanes[..., lane]
         one.inside = False
 
     def _take_in(self, rope: CompiledRope, lane: int) -> None:
+        find, arrays = self._all
+        for own, lanes in zip(find(rope.state), arrays, strict=True):
+            lanes[..., lane] = own
         rod = rope.state.rod
-        for used, arrays in (self._changing, _changing(rope.state)), (self._lasting, _lasting(rod)):
-            for place, lanes in used:
-                lanes[..., lane] = arrays[place]
         numbers = self.state.numbers[:, lane]
         numbers[DRAG], numbers[IMPLICIT] = rod.drag, rod.implicit
         numbers[FRICTION] = rope.state.contact.friction
@@ -110,22 +117,6 @@ class Lanes:
         entries.advance_together(
             (*moves, *[moves[0]] * (COUNT - len(moves))), self._packed, count, len(moves))
         advanced()
-
-
-# What steps change of a rope, and what they do not, by the names of `Together`:
-_CHANGING = ('points', 'velocities', 'support', 'angles', 'clamps', 'carried', 'joints', 'kept')
-_LASTING = ('rest_lengths', 'stiffness', 'masses', 'bending', 'natural', 'twisting', 'rows')
-
-
-def _changing(rope: RopeState) -> tuple[Floats, ...]:
-    frame = rope.rod.frame
-    return (rope.points, rope.velocities, rope.support, frame.angles, frame.clamps, frame.carried,
-            frame.joints, rope.rod.friction.kept)
-
-
-def _lasting(rod: RodState) -> tuple[Floats, ...]:
-    return (rod.rest_lengths, rod.stiffness, rod.masses, rod.bending, rod.frame.natural, rod.frame.twisting,
-            rod.friction.rows)
 
 
 class RolloutUnderWay:
@@ -140,17 +131,19 @@ class RolloutUnderWay:
     def __init__(self, number: int, script: Script, rope: CompiledRope) -> None:
         self.number, self.rope, self._course = number, rope, course(script, rope)
         self.inside = False  # whether its state is in a lane
-        self.left = 0  # steps until its move ends, at most
         self.kind: Hashable = None
         self.outcome: Rollout | SimulationError | None = None
         self._take_next(None)
 
     @property
+    def left(self) -> int:
+        """Steps until its move ends, at most."""
+        return self._steps.number - int(self.move['progress'].item(0))
+
+    @property
     def arrived(self) -> bool:
         """Whether its move has ended."""
-        taken, _, _, ending = self.move['progress'].tolist()
-        self.left = self._steps.number - taken
-        return self.left == 0 or ending != GOES_ON
+        return self.move['progress'].item(3) != GOES_ON or self.left == 0
 
     def go_on(self) -> None:
         """Go on after a move."""
@@ -187,7 +180,6 @@ class RolloutUnderWay:
                          None if steps.turns is None else steps.turns[:1])
         until_check = periods[0] - first if len(periods) else 0
         self.move['progress'][:] = first, until_check, 0, GOES_ON
-        self.left = steps.number - first
         self.kind = rope.kind
         return True
 

@@ -126,7 +126,7 @@ def test_what_was_simulated_before_makes_no_difference():
 def test_scripts_that_are_too_long_to_keep_are_written_again(rows, monkeypatch):
     jobs = [(trial, physical) for physical in drawn(CABLES, 2) for trial in (carried(0.1, 0.2), turned(1.0))]
     expected = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
-    monkeypatch.setattr(engine, 'MOST_ROWS', rows)
+    monkeypatch.setattr(engine, 'MOST_POSITIONS', rows)
     found = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
     assert [one.chains.tobytes() for one in found] == [one.chains.tobytes() for one in expected]
 
