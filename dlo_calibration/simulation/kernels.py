@@ -36,15 +36,16 @@ HELD = 1e12  # weight of the equation that gives a held node its velocity, relat
 
 
 @part
-def _solve(bands: Matrix, right: Vector) -> bool:
+def _solve(bands: Matrix, right: Vector, solution: Matrix) -> bool:
     """
-    Solve a banded symmetric system in place, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
+    Solve a banded symmetric system, by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 
     Each column is finished at once from the six before it.  The last one stays in registers, so that nothing
     that the next pivot waits for comes from memory.
 
     :param bands: (6 + m, 7) columns of the lower triangle after six of zeros; becomes 1 / D and L D.
-    :param right: (m,) right side; becomes the solution.
+    :param right: (m,) right side; becomes D^-1 L^-1 of it.
+    :param solution: (m / 3, 3) gets the solution.
     :returns: False if the matrix is not positive definite or a value is not finite.
     """
     size = len(right)
@@ -84,14 +85,15 @@ def _solve(bands: Matrix, right: Vector) -> bool:
         right[j] = value * inverse
     total = 0.0
     r1, r2, r3, r4, r5, r6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for j in range(size - 1, -1, -1):
-        column, value = bands[j + 6], right[j]
-        inverse = column[0]
-        value = value - column[6] * inverse * r6 - column[5] * inverse * r5 - column[4] * inverse * r4
-        value = value - column[3] * inverse * r3 - column[2] * inverse * r2 - column[1] * inverse * r1
-        r1, r2, r3, r4, r5, r6 = value, r1, r2, r3, r4, r5
-        right[j] = value
-        total += value
+    for i in range(len(solution) - 1, -1, -1):
+        for c in range(2, -1, -1):
+            column, value = bands[3 * i + c + 6], right[3 * i + c]
+            inverse = column[0]
+            value = value - column[6] * inverse * r6 - column[5] * inverse * r5 - column[4] * inverse * r4
+            value = value - column[3] * inverse * r3 - column[2] * inverse * r2 - column[1] * inverse * r1
+            r1, r2, r3, r4, r5, r6 = value, r1, r2, r3, r4, r5
+            solution[i, c] = value
+            total += value
     solved: bool = both(finite(total), least > 0.0)
     return solved
 
@@ -239,18 +241,16 @@ def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted:
     if len(rod.frame.angles) > 0:
         add_frame(rod.frame, step, right)
     _hold(rod.bands[BAND - 1:], right, rod.masses, rod.held, rod.follow)
-    solved = _solve(rod.bands, right)
-    for i in range(len(points)):
-        for c in range(3):
-            predicted[i, c] = right[3 * i + c]
+    solved = _solve(rod.bands, right, predicted)
     let_follow(predicted, rod.held, rod.follow)
     return solved
 
 
 @part
-def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: float, step: float) -> None:
+def rest_on_table(points: Matrix, predicted: Matrix, velocities: Matrix, level: float, friction: float,
+                  step: float) -> None:
     """
-    Correct `velocities` for contact with a table, with Coulomb friction.
+    Write to `velocities` what `predicted` becomes by contact with a table, with Coulomb friction.
 
     The constants are Bullet's (PyBullet 3.2.7), found by single steps of a sphere on a plane.
 
@@ -262,15 +262,15 @@ def rest_on_table(points: Matrix, velocities: Matrix, level: float, friction: fl
         distance = points[i, 2] - level
         depth = -(distance + slop)
         least = where(depth > 0.0, 0.08 * depth / step, depth / step)  # one step corrects 8 %
-        push = least - velocities[i, 2]
+        vx, vy, vz = predicted[i, 0], predicted[i, 1], predicted[i, 2]
+        push = least - vz
         touches = both(distance < margin, push > 0.0)
         if some(touches):
-            vx, vy = velocities[i, 0], velocities[i, 1]
             speed = math.sqrt(vx * vx + vy * vy)
             share = where(speed > 0.0, 1.0 - min(1.0, friction * push / speed), 0.0)
-            share = where(touches, share, 1.0)  # and not the products: a masked store takes long
-            velocities[i, 0], velocities[i, 1] = share * vx, share * vy
-            velocities[i, 2] = where(touches, least, velocities[i, 2])
+            share = where(touches, share, 1.0)
+            vx, vy, vz = share * vx, share * vy, where(touches, least, vz)
+        velocities[i, 0], velocities[i, 1], velocities[i, 2] = vx, vy, vz
 
 
 @part
@@ -327,10 +327,7 @@ def advance(rope: RopeState, targets: Cube, turns: Cube, level: float, path: Cub
             turn_clamps(rod.frame.clamped, rod.frame.clamps, turns[k])
         if is_near(contact, points, movement(velocities, step), movement(predicted, step)):
             keep_apart(contact, points, predicted, inverse_masses, support, step)
-        for i in range(len(points)):
-            for c in range(3):
-                velocities[i, c] = predicted[i, c]
-        rest_on_table(points, velocities, level, friction, step)
+        rest_on_table(points, predicted, velocities, level, friction, step)
         for h in range(len(held)):
             for c in range(3):
                 velocities[held[h], c] = follow[h, c]

@@ -169,10 +169,7 @@ def advance_together(moves: Moves, together: Together, count: int, used: int) ->
             _follow_through(c, together, lane[2])
         if used > 3:
             _follow_through(d, together, lane[3])
-        for i in range(len(points)):
-            for k in range(3):
-                velocities[i, k] = predicted[i, k]
-        rest_on_table(points, velocities, lanes[LEVEL], lanes[FRICTION], step)
+        rest_on_table(points, predicted, velocities, lanes[LEVEL], lanes[FRICTION], step)
         let_follow(velocities, rod.held, rod.follow)
         for i in range(len(points)):
             for k in range(3):
