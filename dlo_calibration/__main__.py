@@ -24,6 +24,7 @@ def begin_to_load() -> None:
 def main() -> int:
     """Execute the command line of the process; return the exit code, as `cli.main.main` does."""
     end_at_signals('dlo-calibration')
+    gc.set_threshold(50_000, 20, 20)  # what is being loaded is no garbage, and looking through it takes long
     # Where they were closed by whoever started the process, Python has none.
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:

@@ -26,7 +26,7 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation.protocol import TogetherSimulator
 
-AT_A_TIME = 24  # rollouts: six for each lane, of which some are empty only towards the end
+AT_A_TIME = 48  # rollouts: twelve for each lane, of which some are empty only towards the end
 
 
 class BatchEvaluator:

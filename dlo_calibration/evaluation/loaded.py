@@ -11,11 +11,13 @@ each process loads when it needs it, and tells of it then.
 from __future__ import annotations
 
 from contextlib import suppress
+import gc
 from importlib import import_module
 import sys
 
 sys.path[:] = filter(None, sys.path)  # not the folder in which the user works: files there may have any name
 
+gc.disable()  # what is being loaded is no garbage
 with suppress(Exception):
     from dlo_calibration.simulation.kernel_cache import is_compiled, SIMULATION, TOGETHER
     from dlo_calibration.simulation.machine_code import load
@@ -26,3 +28,5 @@ with suppress(Exception):
         if is_compiled(_kernels):
             load(_kernels)
     import_module('dlo_calibration.simulation.bullet')  # last, as it is needed last
+gc.freeze()  # no process that is forked ever looks through it
+gc.enable()
