@@ -76,13 +76,13 @@ def confirming(result: CalibrationResult, options: Options, make_simulator: Simu
         return None
     try:
         simulator = make_simulator(replace(options, engine=CONFIRMING))
+        if simulator.name == result.engine:
+            simulator.close()
+            return None
+        return SimulatedAhead(simulator, executor, result.trials,
+                              result.space.physical(result.best.values, result.length))
     except Exception:
         return None
-    if simulator.name == result.engine:
-        simulator.close()
-        return None
-    return SimulatedAhead(simulator, executor, result.trials,
-                          result.space.physical(result.best.values, result.length))
 
 
 def confirmed(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,

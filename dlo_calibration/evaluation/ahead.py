@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from contextlib import closing
 from typing import Mapping, Sequence
 
+from dlo_calibration.evaluation.kept import kept_simulator, packed_simulator
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
@@ -17,7 +17,7 @@ class SimulatedAhead:
     """
     A simulator of some trials with one parameter set, whose rollouts are under way from the beginning.
 
-    :param simulator: sent to the executor with each trial; it is closed with this one.
+    :param simulator: sent to the executor, whose workers keep it; it is closed with this one.
     :param executor: simulates the trials, each in one call.
     :param physical: parameters by name (SI units).
     """
@@ -26,7 +26,8 @@ class SimulatedAhead:
                  physical: Mapping[str, float]) -> None:
         self.name = simulator.name
         self._simulator, self._physical = simulator, dict(physical)
-        self._rollouts = {id(trial): executor.submit(_simulated, simulator, trial, self._physical)
+        packed = packed_simulator(simulator)
+        self._rollouts = {id(trial): executor.submit(_simulated, packed, trial, self._physical)
                           for trial in trials}
 
     def prepare(self) -> None:
@@ -53,7 +54,6 @@ class SimulatedAhead:
         self._simulator.close()
 
 
-def _simulated(simulator: Simulator, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-    """Simulate a trial in a worker, with a simulator that was sent with it."""
-    with closing(simulator):
-        return simulator.simulate(trial, physical)
+def _simulated(packed: bytes, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+    """Simulate a trial in a worker."""
+    return kept_simulator(packed).simulate(trial, physical)

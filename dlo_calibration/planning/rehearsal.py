@@ -6,19 +6,16 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
-import copy
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 import math
-import pickle
-import threading
 from typing import Callable, Mapping, Sequence
-import uuid
 
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.batch import AT_A_TIME
+from dlo_calibration.evaluation.kept import kept_simulator, packed_simulator
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
@@ -161,8 +158,7 @@ class Rehearser:
         self._executor = executor
         self._should_stop = should_stop
         self._takes_part = takes_part
-        self._key = uuid.uuid4().hex  # identifies this simulator in the workers
-        self._packed = b'' if executor is None else pickle.dumps(simulator, pickle.HIGHEST_PROTOCOL)
+        self._packed = b'' if executor is None else packed_simulator(simulator)
 
     def __call__(self, jobs: Sequence[Job]) -> list[Rehearsal]:
         """
@@ -181,7 +177,7 @@ class Rehearser:
     def _rehearsed_by(self, executor: Executor, jobs: Sequence[Job]) -> list[Rehearsal]:
         size = self._portion(executor, len(jobs))
         portions = [jobs[first:first + size] for first in range(0, len(jobs), size)]
-        futures = [executor.submit(_rehearse_in_worker, self._key, self._packed, portion)
+        futures = [executor.submit(_rehearse_in_worker, self._packed, portion)
                    for portion in portions]
         own: list[list[Rehearsal]] = []  # of the last portions, in reverse order
         try:
@@ -213,23 +209,8 @@ class Rehearser:
                     raise
 
 
-class _WorkerThread(threading.local):
-    """The simulator that a worker's thread keeps."""
-
-    key = ''
-    simulator: Simulator
-
-
-_worker_thread = _WorkerThread()
-
-
-def _rehearse_in_worker(key: str, packed: bytes, jobs: Sequence[Job]) -> list[Rehearsal]:
+def _rehearse_in_worker(packed: bytes, jobs: Sequence[Job]) -> list[Rehearsal]:
     """Rehearse jobs in a worker, which keeps the simulator of a plan."""
-    if _worker_thread.key != key:
-        if _worker_thread.key:
-            _worker_thread.simulator.close()
-        _worker_thread.simulator = copy.copy(pickle.loads(packed))  # noqa: S301  # sent by the parent process
-        _worker_thread.key = key
-    return rehearse(_worker_thread.simulator, jobs)
+    return rehearse(kept_simulator(packed), jobs)
 
 
