@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Mapping
 
 import numpy as np
@@ -40,7 +41,7 @@ class Evaluation:
     failure: str = ''
     skipped: int = 0
 
-    @property
+    @cached_property
     def score(self) -> float:
         """Average difference score over the trials [cm]; infinite if the evaluation failed."""
         return float(np.mean(self.scores)) if self.scores else float('inf')

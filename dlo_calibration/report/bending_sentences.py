@@ -14,7 +14,6 @@ from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE
 from dlo_calibration.model.bending import natural_curvature
 from dlo_calibration.model.parameters import knot_names
 from dlo_calibration.model.quantity import interval, measured, number
-from dlo_calibration.planning.dlo import Posterior
 
 DRAWS = 200  # of the posterior, for an interval
 
@@ -24,6 +23,8 @@ def rest_shape_sentences(result: CalibrationResult) -> list[str]:
     names = [name for name in knot_names(result.space.knots) if name in result.parameters]
     if not names:
         return []
+    from dlo_calibration.planning.dlo import Posterior  # the planner comes with it, which few results need
+
     places = np.linspace(0, 1, 101)
     size = np.hypot(*natural_curvature(result.physical(), places).T)
     most = int(size.argmax())
