@@ -53,7 +53,7 @@ class _ClosedHand:
     turns: Floats  # (k + 1, 9) in each of these steps, and none
 
     def grip(self, steps: int, count: int) -> Grip:
-        """Return what it does after so many steps of the trial."""
+        """Return what it does in the `count` steps after `steps` of the trial."""
         first = steps - self.since
         return Grip(self.rows, _rows(self.positions, first, count),
                     None if self.rotations is None else _rows(self.rotations, first, count),
