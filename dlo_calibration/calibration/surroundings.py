@@ -9,7 +9,6 @@ from concurrent.futures import CancelledError
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.setting import Setting
@@ -18,6 +17,7 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
+from dlo_calibration.inference.uncertainty import Uncertainty
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import REST_SHAPE
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
@@ -70,32 +70,29 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     finally:
         if finer is not None:
             finer.close()
-    excited = examination.uncertainty.excited
-    point = np.where(excited, best.point, default)
-    if np.array_equal(point, best.point):
-        return examination, best
-    points = np.stack([point, _moved_along(point, best, examination.jacobian, excited)])
-    seen = list(evaluate(points, best.index))
-    if len(seen) < len(points):
-        raise CancelledError
-    loss = Huber.of(best.residuals)
-    again = replace(min(seen, key=lambda one: loss.cost(one.residuals)), index=best.index)
-    examination = replace(examination, evaluations=examination.evaluations + len(points))
-    found = examination.uncertainty
-    # The cost is half the sum of squares; 10 % exceed a chi-square of 2.71 with one degree of freedom.
-    worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / found.scale**2
-    if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the found values stay
-        found = replace(found, excited=excited | (point != best.point))
-        return replace(examination, uncertainty=found), best
-    return examination, again
+    found, jacobian = examination.uncertainty, examination.jacobian
+    point, again = np.where(found.excited, best.point, default), best
+    if not np.array_equal(point, best.point):
+        step = np.clip(_step(Linearisation(best.point, best.residuals, jacobian).at(point), found), -0.1, 0.1)
+        points = np.stack([point, np.clip(point + step, 0.0, 1.0)])
+        seen = list(evaluate(points, best.index))
+        if len(seen) < len(points):
+            raise CancelledError
+        loss = Huber.of(best.residuals)
+        again = replace(min(seen, key=lambda one: loss.cost(one.residuals)), index=best.index)
+        examination = replace(examination, evaluations=examination.evaluations + len(points))
+        # The cost is half the sum of squares; 10 % exceed a chi-square of 2.71 with one degree of freedom.
+        worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / found.scale**2
+        if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the found values stay
+            found, again = replace(found, excited=found.excited | (point != best.point)), best
+    assert again.residuals is not None
+    left = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
+    return replace(examination, uncertainty=found.at(best.point, again.point, left)), again
 
 
-def _moved_along(point: Floats, best: Evaluation, jacobian: Floats, excited: NDArray[np.bool_]) -> Floats:
-    """Return the (d,) `point` after a Gauss-Newton step of the excited parameters, of 0.1 at most in each."""
-    assert best.residuals is not None
-    fit = Linearisation(best.point, best.residuals, jacobian)
-    there = replace(fit, residuals=fit.predicted(point - best.point))
-    step = there.columns(excited).weighted(Huber.of(best.residuals).roots(best.residuals)).step()
-    moved = np.array(point)
-    moved[excited] = np.clip(point[excited] + np.clip(step, -0.1, 0.1), 0.0, 1.0)
-    return moved
+def _step(fit: Linearisation, found: Uncertainty) -> Floats:
+    """Return the (d,) Gauss-Newton step of the excited parameters to the minimum, within the unit cube."""
+    step = np.zeros(len(fit.point))
+    free = fit.columns(found.excited).weighted(Huber.of(fit.residuals).roots(fit.residuals))
+    step[found.excited] = free.step(np.eye(len(free.point)) * found.residual**2)
+    return np.asarray(np.clip(fit.point + step, 0.0, 1.0) - fit.point)

@@ -66,6 +66,10 @@ class Linearisation:
         """Return the (m,) residuals [m] after a (d,) step."""
         return np.asarray(self.residuals + self.jacobian @ step)
 
+    def at(self, point: Floats) -> Linearisation:
+        """Return the model around another (d,) point, as this one predicts it."""
+        return Linearisation(point, self.predicted(point - self.point), self.jacobian)
+
     def step(self, prior: Floats | None = None) -> Floats:
         """
         Return the (d,) Gauss-Newton step to the least sum of squared residuals.

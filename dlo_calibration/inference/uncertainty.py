@@ -6,14 +6,15 @@ Uncertainty: the covariance and the intervals of the calibrated parameters, in t
 
 If the search ended in a regular minimum, the covariance follows from the
 Jacobian of the residuals there.  The textbook's formula alone is several times
-too small for real DLOs.  Five things are therefore added:
+too small for real DLOs.  Six things are therefore added:
 
 - the errors of neighbouring points are correlated, so that these count as fewer;
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
 - if the model cannot explain the residuals, the trials disagree with each other; the jackknife and
   the bootstrap over the trials measure how much, and the larger of both counts;
 - the step and the nodes of the simulation move the optimum;
-- trials that look alike share the error of the model, so that repeating one averages only its noise.
+- trials that look alike share the error of the model, so that repeating one averages only its noise;
+- the reported point may be beside the minimum, after a search that does not converge (`Uncertainty.at`).
 
 If it did not, as in a random search, the spread of the best evaluations is used.
 """
@@ -112,6 +113,30 @@ class Uncertainty:
             covariance=None if self.covariance is None else
             frozen_array(self.covariance * np.outer(wider, wider)))
 
+    def at(self, point: Floats, there: Floats, left: Floats) -> Uncertainty:
+        """
+        Return the uncertainty at another point, which may not be quite a minimum.
+
+        The standard deviations become the root mean square distance of the parameters from it.  Ends of the
+        scale stay ends of the intervals.
+
+        :param point: (d,) that this is the uncertainty at.
+        :param there: (d,) the other point.
+        :param left: (d,) how far the minimum is from it.
+        """
+        std = np.minimum(np.hypot(self.std, left), UNKNOWN_STD)
+        wider, covariance = std / self.std, self.covariance
+        if covariance is not None:
+            covariance = covariance + np.outer(left, left)
+            shrink = np.minimum(1.0, std / np.sqrt(np.diag(covariance)))
+            covariance = frozen_array(covariance * np.outer(shrink, shrink))
+        lower = np.maximum(there - wider * (point - self.lower), 0.0)
+        upper = np.minimum(there + wider * (self.upper - point), 1.0)
+        return replace(
+            self, std=frozen_array(std), covariance=covariance, at_bound=self.excited & at_end(there),
+            lower=frozen_array(np.where(self.lower > 0, lower, 0.0)),
+            upper=frozen_array(np.where(self.upper < 1, upper, 1.0)))
+
     @property
     def correlations(self) -> Floats | None:
         """(d, d) correlations of the parameters, symmetric, 1 on the diagonal; None if they are unknown."""
@@ -147,7 +172,7 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
     A parameter that the trials determine has similar values in all good
     evaluations; the others scatter.  `std` is the root mean square distance of
     the best 5 % (8 at least) from the (d,) point `best`; `lower` and `upper` are
-    their extremes.  With too few evaluations, no parameter is identifiable.  The
+    the extremes of all of them.  With too few evaluations, no parameter is identifiable.  The
     spread depends on the search as much as on the trials.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
@@ -158,7 +183,8 @@ def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
         return Uncertainty(unknown * UNKNOWN_STD, unknown * 0, unknown, everywhere, ~everywhere)
     points = np.stack([e.point for e in good[:count]])
     std = np.minimum(np.sqrt(np.mean((points - best) ** 2, axis=0)), UNKNOWN_STD)
-    return Uncertainty(std, points.min(axis=0), points.max(axis=0), everywhere, ~everywhere)
+    return Uncertainty(std, np.minimum(points.min(axis=0), best), np.maximum(points.max(axis=0), best),
+                       everywhere, ~everywhere)
 
 
 def prior_information(dimension: int) -> Floats:
@@ -214,9 +240,13 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     std = np.where(excited, np.sqrt(np.diag(covariance)), UNKNOWN_STD)
     lower = np.where(excited, np.maximum(point - DEVIATIONS * std, 0.0), 0.0)
     upper = np.where(excited, np.minimum(point + DEVIATIONS * std, 1.0), 1.0)
-    at_bound = excited & ((point < 0.002) | (point > 0.998))
-    return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited, at_bound,
-                       frozen_array(covariance), residual, scale)
+    return Uncertainty(frozen_array(std), frozen_array(lower), frozen_array(upper), excited,
+                       excited & at_end(point), frozen_array(covariance), residual, scale)
+
+
+def at_end(point: Floats) -> NDArray[np.bool_]:
+    """Return (d,) True where a (d,) point is at an end of the scale."""
+    return np.asarray((point < 0.002) | (point > 0.998))
 
 
 def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:

@@ -109,6 +109,24 @@ def test_a_default_that_the_trials_refute_is_not_kept(default, kept):
     assert result.best.values == result.values
 
 
+@pytest.mark.parametrize('free', [('flexibility', 'friction'), ('flexibility', 'friction', 'damping')])
+def test_intervals_of_a_search_that_ends_beside_the_minimum_are_around_its_values(free):
+    others = {name: value for name, value in TRUTH.items() if name not in free}
+    regular, inside = 0, []
+    for seed in range(25):
+        rough = np.random.default_rng(seed)
+        trials = [replace(trial, goals=(replace(trial.goals[0], chain=replace(
+            trial.goals[0].chain, points=trial.goals[0].chain.points + rough.normal(0, 5e-3, (91, 3)))),))
+            for trial in (toy_trial(TRUTH, n=91), toy_trial(TRUTH, 'trial 2', n=91, turn=1.0))]
+        result = found(trials, ParameterSpace(free, others), seed=seed)
+        regular += result.examination.regular
+        assert all(one.lower <= one.value <= one.upper for one in result.parameters.values())
+        inside += [result.parameters[name].lower <= TRUTH[name] <= result.parameters[name].upper
+                   for name in ('flexibility', 'friction')]
+    assert regular > 12  # linear models are what is tested here
+    assert np.mean(inside) >= 0.85
+
+
 def test_a_value_at_the_end_of_the_scale_is_noted_at_either_end():
     truth = {**TRUTH, 'flexibility': 0.0, 'friction': 100.0}
     result = searched(ParameterSpace(('flexibility', 'friction', 'elasticity'),

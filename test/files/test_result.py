@@ -187,7 +187,6 @@ def test_any_text_and_number_survives(tmp_path_factory, result, text, value, len
     (('identifiable="', 'identifiable="per'), 'identifiable'),
     (('<correlation first="friction"', '<correlation first="flexibility"'), '<correlation>.*two found'),
     (('<correlation first="friction"', '<correlation first="damping"'), "<correlation>.*'damping'"),
-    (('second="flexibility" value="', 'second="flexibility" value="9'), '<correlation>.*-1 to 1'),
     (('second="flexibility" value="', 'second="flexibility" value="nan'), '<correlation>.*value'),
     (('<options>', '<options>text'), '<options>'),
     (('<warnings/>', '<warnings/><warnings/>'), '<warnings>'),
@@ -200,6 +199,12 @@ def test_unexpected_is_refused_by_line_and_element(file, change, match):
     line = text[:text.index(change[0])].count('\n') + 1
     file.write_text(text.replace(*change, 1), encoding='utf-8')
     assert f', line {line}, element <' in refused(file, match)
+
+
+def test_a_correlation_is_a_cosine(file):
+    text = re.sub('(second="flexibility" value=")[^"]*', r'\g<1>-1.1', file.read_text(encoding='utf-8'))
+    file.write_text(text, encoding='utf-8')
+    refused(file, '<correlation>.*-1.1.*-1 to 1')
 
 
 @pytest.mark.parametrize('change, match', [

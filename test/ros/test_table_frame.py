@@ -5,6 +5,7 @@
 
 import re
 import sys
+import time
 from types import ModuleType, SimpleNamespace
 
 from live import live_node, robot_types
@@ -112,7 +113,8 @@ def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_
             pairs[-1][1].header.stamp.nanosec = 4_000_000 * k
             robot.send(pairs[-1:])
         robot.until(lambda: len(robot.calibrator.session.collecting.collector._known) == len(pairs) + 200)
-        monkeypatch.setattr(calibrator_node, 'SLICE', 1e-4)
+        session, anew = robot.calibrator.session, robot.calibrator.session.collect_anew
+        monkeypatch.setattr(session, 'collect_anew', lambda: (time.sleep(0.005), anew()))
         monkeypatch.setattr(calibrator_node, 'ANSWER', 1e-4)
         pose = Parameter('frame_pose', value='0 0 -0.75 0 0 0 1')
         assert robot.calibrator.set_parameters([pose])[0].successful
