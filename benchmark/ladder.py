@@ -9,7 +9,8 @@ Measure the rungs: what fewer nodes and longer steps cost and save in searches.
 Searches are those of the sessions, by default of the five samples.  Each is made with the default nodes and
 steps, and on each rung.  The result of a rung then climbs: least squares goes on with the default ones from
 there, with the Jacobian that it has; of the points of another search, the tenth with the lowest scores is
-evaluated again.  All is simulated in one process.  The table is printed, and that of the samples written to
+evaluated again.  The random search tries the same points on all rungs, so that their scores are compared,
+too.  All is simulated in one process.  The table is printed, and that of the samples written to
 benchmark/results/ladder.md.
 """
 
@@ -34,6 +35,7 @@ from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares, SEARCHES
+from dlo_calibration.search.random import RandomSearch
 from dlo_calibration.simulation import together  # noqa: F401  # loaded before the first measurement
 
 RESULTS = Path(__file__).resolve().parent / 'results'
@@ -81,15 +83,16 @@ class Comparison:
 
         :param name: of the search.
         """
-        usual, _ = timed(lambda: self._search(name, self._default, 1))
+        usual, fine = timed(lambda: self._search(name, self._default, 1))
         other, _ = timed(lambda: self._search(name, self._default, 2))
-        rows = [[usual.evaluations, usual.seconds, self._away(other.point, usual.point), 0, usual.seconds,
-                 self._away(other.point, usual.point)]]
+        away = self._away(other.point, usual.point)
+        rows = [[usual.evaluations, usual.seconds, away, 0.0, 0, usual.seconds, away]]
         for nodes, step in RUNGS:
             setting = self._on(replace(self._options, nodes=nodes, time_step=step))
             coarse, found = timed(lambda setting=setting: self._search(name, setting, 1))
             climbed, _ = timed(lambda found=found: self._climb(found))
-            rows.append([coarse.evaluations, coarse.seconds, self._away(coarse.point, usual.point),
+            apart = scores_apart(fine, found) if name == RandomSearch.name else 0.0
+            rows.append([coarse.evaluations, coarse.seconds, self._away(coarse.point, usual.point), apart,
                          climbed.evaluations, coarse.seconds + climbed.seconds,
                          self._away(climbed.point, usual.point)])
         return rows
@@ -107,6 +110,12 @@ class Comparison:
         ranked = sorted(found.evaluations, key=lambda one: one.score)[:len(found.evaluations) // 10]
         again = list(self._default.evaluate(self._space)(np.array([one.point for one in ranked]), 0))
         return replace(found, best=min(again, key=lambda one: one.score), evaluations=tuple(again))
+
+
+def scores_apart(one: Fit, other: Fit) -> float:
+    """Return the median difference [cm] of the scores of two searches that tried the same points."""
+    return float(np.median([abs(first.score - second.score)
+                            for first, second in zip(one.evaluations, other.evaluations, strict=True)]))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -129,12 +138,14 @@ def searches(sessions: Sequence[Path]) -> str:
     for name in SEARCHES:
         each = np.array([one.rows(name) for one in compared])  # (sessions, rungs, numbers)
         for k, rung in enumerate((None, *RUNGS)):
-            evaluations, seconds, away, again, both, after = each[:, k].T
+            evaluations, seconds, away, apart, again, both, after = each[:, k].T
             rows.append([name, name_of(rung), f'{evaluations.mean():.0f}', f'{seconds.sum():.1f}',
-                         f'{away.mean():.2f} ({away.max():.2f})', f'{again.mean():.0f}' if rung else '',
-                         f'{both.sum():.1f}' if rung else '',
+                         f'{away.mean():.2f} ({away.max():.2f})',
+                         f'{apart.mean():.1f} ({apart.max():.1f})' if apart.any() else '',
+                         f'{again.mean():.0f}' if rung else '', f'{both.sum():.1f}' if rung else '',
                          f'{after.mean():.2f} ({after.max():.2f})' if rung else ''])
-    return table(('search', 'rung', 'evaluations', 's', 'error', 'evaluations after climbing', 's in all',
+    return table(('search', 'rung', 'evaluations', 's', 'error', 'scores differ by, cm',
+                  'evaluations after climbing', 's in all',
                   'error after climbing'), rows)
 
 
@@ -153,8 +164,9 @@ def main() -> None:
 
 Searches on the five samples. Error: the largest distance of a found value from that with the default nodes
 and steps, in units of its 90 % interval; parameters with intervals above half of the range are left out. Mean
-over the samples (largest). In the row `default` it is that of another seed. Seconds are those of one process,
-for all samples.
+over the samples (largest). In the row `default` it is that of another seed. Scores of the same random points
+differ by the median of all; mean over the samples (largest). Seconds are those of one process, for all
+samples.
 
 {searches([samples() / f'object{k}' for k in range(1, 6)])}
 """
