@@ -40,7 +40,7 @@ def _compiled(options: Options) -> Simulator:
 def _auto(options: Options) -> Simulator:
     """Return the compiled engine, or Bullet with a warning if there is a scene."""
     if options.scene:
-        _warn_once('PyBullet simulates the evaluations, about 60 times slower, because engine compiled does '
+        _warn_once('PyBullet simulates the evaluations, about 50 times slower, because engine compiled does '
                    f'not support a scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)

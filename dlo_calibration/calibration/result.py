@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Mapping, Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import mean_length
-from dlo_calibration.evaluation.residuals import ResidualLayout
+from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.inference.advice import Advice
 from dlo_calibration.inference.confirmation import Confirmation, DISTANCE_TOLERANCE
 from dlo_calibration.inference.examination import Examination
@@ -25,6 +26,7 @@ from dlo_calibration.inference.uncertainty import (
     IDENTIFIABLE,
     INVOLVED,
     NOT_IDENTIFIABLE,
+    predictive_std,
     spread_of_best,
     Uncertainty,
 )
@@ -157,6 +159,14 @@ class CalibrationResult:
             return None
         return {one: dict(zip(names, map(float, row), strict=True))
                 for one, row in zip(names, found.uncertainty.correlations, strict=True)}
+
+    @cached_property
+    def band(self) -> Floats | None:
+        """(p,) standard deviation of each simulated goal point [m], from the parameters'; None: unknown."""
+        found = self.examination
+        if found is None or not found.regular or found.uncertainty.covariance is None:
+            return None
+        return at_every_goal(predictive_std(found.jacobian, found.uncertainty.covariance), self.trials)
 
     @property
     def std(self) -> Floats:

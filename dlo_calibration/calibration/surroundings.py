@@ -14,11 +14,11 @@ from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
+from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.examination import Examination, examine
 from dlo_calibration.inference.uncertainty import Uncertainty
-from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import REST_SHAPE
 from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
 
@@ -39,9 +39,7 @@ def examined(setting: Setting, fit: Fit) -> Fit:
     except CancelledError:
         return replace(fit, examination=None, stopped=True)
     count = examination.evaluations + fit.examined
-    band = frozen_array(at_every_goal(examination.band, setting.trials))
-    return replace(fit, best=best, validated=0,
-                   examination=replace(examination, evaluations=count, band=band))
+    return replace(fit, best=best, validated=0, examination=replace(examination, evaluations=count))
 
 
 def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:

@@ -28,7 +28,6 @@ from dlo_calibration.inference.uncertainty import (
     DEVIATIONS,
     noise_alone,
     optimum_shift,
-    predictive_std,
     Uncertainty,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
@@ -53,8 +52,6 @@ class Examination:
         chains [m]; nan if they have too few points.
     :param cross_validated: mean point error of trials that were left out of the fit [m]; nan with one trial.
     :param default_error: mean point error of the default parameters [m]; nan if they cannot be simulated.
-    :param band: (p,) standard deviation of each simulated goal point, from the covariance of the
-        parameters [m].
     :param evaluations: number of parameter sets that were simulated.
     """
 
@@ -64,7 +61,6 @@ class Examination:
     noise: float
     cross_validated: float
     default_error: float
-    band: Floats
     evaluations: int
 
     @property
@@ -108,12 +104,11 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     found = at_minimum(fit, layout, noise=noise, shift=shift,
                        starts=[one for one in drawn if one is not None])
     found = extended(fit, found, residuals_at, fading)
-    assert found.covariance is not None
     return Examination(
         uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
         cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
-        band=frozen_array(predictive_std(fit.jacobian, found.covariance)), evaluations=count)
+        evaluations=count)
 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,

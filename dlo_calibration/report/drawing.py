@@ -76,9 +76,9 @@ class Drawn:
         trial, found = result.trials[k], result.examination
         drawn = cls(trial, result.chains[k], hand_colours([trial]),
                     math.nan if found is None else found.noise)
-        if found is None or not found.regular:
+        if result.band is None:
             return drawn
-        by_goal = ResidualLayout.of(result.trials).by_point(found.band)[k]
+        by_goal = ResidualLayout.of(result.trials).by_point(result.band)[k]
         return replace(drawn, band=np.fmax.reduce(by_goal[drawn._shown()], axis=0))
 
     def goals(self) -> list[tuple[int, str | None]]:

@@ -155,14 +155,14 @@ def most_correlated(correlations: Mapping[str, Mapping[str, float]] | None) -> l
 
 def _errors(result: CalibrationResult, values: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the mean distances to compare [m], by their descriptions; None for an unknown one."""
-    found, noise = result.examination, values['noise_m']
+    noise = values['noise_m']
     return {
         'the parameters above': values['mean_error_m'],
         'a trial that is left out of the fit, predicted from the others': values['cross_validated_error_m'],
         'the default parameters': values['default_error_m'],
         'the noise of the measured points alone': None if noise is None else noise * MEAN_DISTANCE,
         'the uncertainty of the parameters alone (one standard deviation of the simulated points)':
-            None if found is None or not found.regular else float(found.band.mean())}
+            None if result.band is None else float(result.band.mean())}
 
 
 def _trials(result: CalibrationResult) -> dict[str, Any]:

@@ -104,7 +104,7 @@ class CompiledRope(Rope):
 
 
 class CompiledSimulator(Engine[CompiledRope]):
-    """Simulates trials on a table or in the air, about 60 times as fast as `bullet.BulletSimulator`."""
+    """Simulates trials on a table or in the air, about 50 times as fast as `bullet.BulletSimulator`."""
 
     name = 'compiled'
 

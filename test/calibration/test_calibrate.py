@@ -127,6 +127,17 @@ def test_intervals_of_a_search_that_ends_beside_the_minimum_are_around_its_value
     assert np.mean(inside) >= 0.85
 
 
+def test_the_band_says_how_far_points_may_lie_elsewhere():
+    result = found()
+    model = result.examination
+    assert result.band.shape == (22,)
+    # As many points as there are share what the parameters do not know.
+    assert np.sum(result.band**2) == pytest.approx(
+        np.trace(model.jacobian @ model.uncertainty.covariance @ model.jacobian.T))
+    assert replace(result, examination=None).band is None
+    assert replace(result, examination=replace(model, regular=False)).band is None
+
+
 def test_a_value_at_the_end_of_the_scale_is_noted_at_either_end():
     truth = {**TRUTH, 'flexibility': 0.0, 'friction': 100.0}
     result = searched(ParameterSpace(('flexibility', 'friction', 'elasticity'),
@@ -486,7 +497,7 @@ def test_a_few_goals_of_a_stream_are_fitted_and_every_one_is_judged():
     assert result.errors.mean == pytest.approx(np.mean([*apart.ravel(), *np.linalg.norm(
         result.chains[1][0] - trials[1].goals[0].chain.points, axis=1)]))
     assert min(one.errors.max for one in told) > 0.04
-    assert result.examination.band.shape == (91 * 11,)
+    assert result.band.shape == (91 * 11,)
     # The same goals, without those that are not compared, give the same parameters.
     few = replace(first, goals=tuple(first.goals[k] for k in compared_goals(first)))
     assert calibrate((few, TRIALS[1]), options, make_simulator=new_toy).values == result.values

@@ -77,7 +77,7 @@ def test_the_compiled_engine_refuses_a_scene_by_name(scene):
 def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert notices() == [f'PyBullet simulates the evaluations, about 60 times slower, because engine '
+    assert notices() == [f'PyBullet simulates the evaluations, about 50 times slower, because engine '
                          f'compiled does not support a scene: {scene}']
 
 

@@ -229,12 +229,3 @@ def test_a_stop_in_the_middle_is_passed_on():
     model = noisy_model()
     with pytest.raises(Stopped):
         examine(TRUTH, model.at(TRUTH), LAYOUT, stopping, default=DEFAULT, noise=NOISE)
-
-
-def test_the_band_says_how_far_points_may_lie_elsewhere():
-    found = examined(noisy_model())
-    assert found.band.shape == (ROWS // 3,)
-    # As many points as there are share what the two parameters do not know.
-    covariance = found.uncertainty.covariance
-    expected = np.sqrt(np.trace(found.jacobian @ covariance @ found.jacobian.T))
-    assert np.sqrt(np.sum(found.band**2)) == pytest.approx(expected)
