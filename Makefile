@@ -95,6 +95,7 @@ figures: bench
 	cp build/experiment/worth.md benchmark/results/worth.md
 	cp build/experiment/worth.png doc/worth.png
 	for name in from_photographs live_information $(if $(MEASURED),elastica intervals experiment); do $(PYTHON) benchmark/$$name.py; done
+	$(if $(MEASURED),$(PYTHON) benchmark/intervals.py --search random --draws 40)
 
 clean:
 	@rm -rf $(VENV) build install log dist *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -4,12 +4,13 @@
 """
 Compare calibrations of the reference objects with their true parameters, over many draws of the noise.
 
-    python benchmark/intervals.py [--draws 100] [--workers 2]
+    python benchmark/intervals.py [--draws 100] [--search NAME] [--workers 2]
 
 Each draw adds new noise of 1 mm per coordinate to the exact chains, calibrates
-the paper's four parameters on four actions with the default search, and tries
-the result on the five other actions.  The table is printed, and written to
-benchmark/results/intervals.md.  Reads the folder reference of DLO_DATA.
+the paper's four parameters on four actions, and tries the result on the five
+other actions.  The table is printed, and written to benchmark/results/intervals.md;
+with another search than the default one, to intervals_NAME.md.  Reads the folder
+reference of DLO_DATA.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 import multiprocessing
 from pathlib import Path
 import sys
@@ -38,6 +40,7 @@ from dlo_calibration.model.parameters import (  # noqa: E402
     BY_NAME,
     PAPER_PARAMETERS,  # noqa: E402
 )
+from dlo_calibration.search import LeastSquares  # noqa: E402
 from dlo_calibration.simulation.compiled import CompiledSimulator  # noqa: E402
 
 NOISE = 1e-3  # m, standard deviation of a coordinate
@@ -69,14 +72,14 @@ def noisy(trial: Trial, generator: np.random.Generator) -> Trial:
                    goals=tuple(replace(goal, chain=chain(goal.chain)) for goal in trial.goals))
 
 
-def draw(name: str, seed: int) -> Draw:
+def draw(name: str, search: str, seed: int) -> Draw:
     """Calibrate on one draw of the noise."""
     properties, exact = exact_trials(name)
     generator = np.random.default_rng(seed)
     trials = [noisy(trial, generator) for trial in exact]
     calibrated = [trial for trial in trials if trial.name in FITTED]
     other = [trial for trial in trials if trial.name not in FITTED]
-    options = Options(mass=properties['mass'], seed=seed)
+    options = Options(mass=properties['mass'], search=search, seed=seed)
     begun = time.perf_counter()
     result = fitted(Setting(tuple(calibrated), options, CompiledSimulator()))
     seconds = time.perf_counter() - begun
@@ -96,8 +99,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--draws', type=int, default=100)
+    parser.add_argument('--search', default=LeastSquares.name)
     parser.add_argument('--workers', type=int, default=2)
     options = parser.parse_args()
+    title, chosen = 'intervals', ''
+    if options.search != LeastSquares.name:
+        title, chosen = f'intervals_{options.search}', f' --search {options.search}'
     rows = ['| object | parameter | truth | mean found | std over draws | median stated std '
             '| 90 % intervals that contain the truth | identifiable |', '|' + '---|' * 8]
     fits = ['| object | evaluations, median | fitted error, mm | unseen actions, mm '
@@ -106,7 +113,7 @@ def main() -> None:
     with ProcessPoolExecutor(options.workers, multiprocessing.get_context('spawn')) as executor:
         for k in range(1, 6):
             name = f'object{k}'
-            draws = list(executor.map(draw, [name] * options.draws, range(options.draws)))
+            draws = list(executor.map(partial(draw, name, options.search), range(options.draws)))
             properties, _ = exact_trials(name)
             for j, parameter in enumerate(PAPER_PARAMETERS):
                 values = np.array([one.values[j] for one in draws])
@@ -127,12 +134,12 @@ def main() -> None:
                 f'| {np.median([one.seconds for one in draws]):.1f} |')
             print(*rows[-4:], fits[-1], sep='\n', flush=True)
     text = (
-        f'# intervals\n\n`python benchmark/intervals.py --draws {options.draws}`: {options.draws} draws of '
-        'the noise for each object. The mean distance that noise alone makes is 1.6 mm.\n\n'
+        f'# {title}\n\n`python benchmark/intervals.py --draws {options.draws}{chosen}`: {options.draws} '
+        'draws of the noise for each object. The mean distance that noise alone makes is 1.6 mm.\n\n'
         + '\n'.join(rows) + '\n\nOver all but self_collision, '
         f'{100 * np.mean(inside):.0f} % of the 90 % intervals contain the truth.\n\n'
         + '\n'.join(fits) + '\n')
-    (HERE / 'results' / 'intervals.md').write_text(text, encoding='utf-8')
+    (HERE / 'results' / f'{title}.md').write_text(text, encoding='utf-8')
     print(text.split('\n\n')[-2])
 
 
