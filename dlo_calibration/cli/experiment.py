@@ -95,8 +95,7 @@ def _plan(chosen: argparse.Namespace) -> Plan:
         judges = _observed(chosen, others[k], FileOptions(own.options.flat())) if others else None
         subjects.append(Subject(name, own, held, judges))
     options = subjects[0].observed.options
-    most = max(subject.observed.options.evaluations for subject in subjects)
-    return Plan(tuple(subjects), searches, chosen.runs, options.seed, most, options.workers,
+    return Plan(tuple(subjects), searches, chosen.runs, options.seed, options.workers,
                 _command(chosen, searches), samples=not chosen.sessions)
 
 

@@ -34,7 +34,6 @@ class Plan:
 
     :param runs: calibrations of each subject with each search, each with its own seed.
     :param seed: of the first run.
-    :param evaluations: largest number in a search; for the tables.
     :param workers: processes; 0: one per core.
     :param command: the command that repeats the experiment.
     :param samples: whether the subjects are the samples of the package.
@@ -44,7 +43,6 @@ class Plan:
     searches: tuple[str, ...]
     runs: int
     seed: int
-    evaluations: int
     workers: int
     command: str
     samples: bool
@@ -54,6 +52,12 @@ class Plan:
             raise InputError('--runs', str(self.runs), '1 or more', 'correct it')
         if not self.searches:
             raise InputError('--search', 'no name', f'one or more of {", ".join(SEARCHES)}', 'name one')
+
+    @property
+    def evaluations(self) -> dict[str, int]:
+        """Largest number of evaluations of a calibration, by search."""
+        return {search: max(one.observed.options_of(search, self.seed).evaluations for one in self.subjects)
+                for search in self.searches}
 
 
 def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],

@@ -35,14 +35,20 @@ class Observed:
     """
     The trials of a DLO, and the options to simulate them with.
 
-    :param options: those that are open are decided from all trials, so that leaving one out changes none.
+    :param options: `calibrate` is decided from all trials if it is open, so that leaving one out does not
+        change it.
     """
 
     trials: tuple[Trial, ...]
     options: Options
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'options', choose(self.trials, self.options).options)
+        object.__setattr__(self, 'options', replace(
+            choose(self.trials, self.options).options, evaluations=self.options.evaluations))
+
+    def options_of(self, search: str, seed: int) -> Options:
+        """Return the options of a calibration; each search has a number of evaluations of its own."""
+        return choose(self.trials, replace(self.options, search=search, seed=seed)).options
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,7 @@ class Task:
     @property
     def options(self) -> Options:
         """The options of the calibration."""
-        return replace(self.subject.observed.options, search=self.search, seed=self.seed)
+        return self.subject.observed.options_of(self.search, self.seed)
 
     @property
     def judges(self) -> Observed:

@@ -60,7 +60,7 @@ class Account:
     :param command: the command that repeats it.
     :param engine: name of the simulator.
     :param runs: number of runs of each object and search that were asked for.
-    :param evaluations: largest number in a search.
+    :param evaluations: largest number in a calibration, by search.
     :param samples: whether the objects are the package's samples, which resemble the paper's.
     :param complete: whether all runs are done.
     """
@@ -69,7 +69,7 @@ class Account:
     command: str
     engine: str
     runs: int
-    evaluations: int
+    evaluations: Mapping[str, int]
     samples: bool
     complete: bool
 
@@ -83,7 +83,7 @@ def document(account: Account) -> dict[str, Any]:
     """Return the account as plain values."""
     paper = {'consistency': PAPER_CONSISTENCY, 'validity': PAPER_VALIDITY} if account.samples else None
     return {'command': account.command, 'engine': account.engine, 'runs': account.runs,
-            'evaluations': account.evaluations, 'complete': account.complete,
+            'evaluations': dict(account.evaluations), 'complete': account.complete,
             'paper': known(paper), 'findings': known([asdict(one) for one in account.findings])}
 
 
@@ -91,8 +91,9 @@ def markdown(account: Account) -> str:
     """Return the account as Markdown."""
     parts = [
         '# Consistency and validity', f'`{account.command}`',
-        f'{account.runs} runs of each object and search, each with its own random seed; at most '
-        f'{account.evaluations} evaluations per calibration; engine {account.engine}.']
+        f'{account.runs} runs of each object and search, each with its own random seed; engine '
+        f'{account.engine}. At most as many evaluations per calibration: '
+        f'{", ".join(f"{search} {count}" for search, count in account.evaluations.items())}.']
     if not account.complete:
         parts.append('**Not complete**: the tables show the runs that are done; '
                      'the same command continues with the others.')

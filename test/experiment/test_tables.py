@@ -27,7 +27,7 @@ from dlo_calibration.model.parameters import knot_names
 
 DONE = [*outcomes(1, 60.0, (10.0, 50.0)), *outcomes(2, 70.0, (40.0, 80.0)), *outcomes(3, 80.0, (20.0, 40.0))]
 FINDINGS = summary(DONE)
-ACCOUNT = Account((FINDINGS,), 'the command', 'toy', 3, 150, samples=False, complete=True)
+ACCOUNT = Account((FINDINGS,), 'the command', 'toy', 3, {'random': 150}, samples=False, complete=True)
 
 
 def cells(text, first):
