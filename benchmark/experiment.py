@@ -37,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--runs', default='20')
-    parser.add_argument('--output', type=Path, default=Path('experiment_output_other'))
+    parser.add_argument('--output', type=Path, default=Path('build/experiment_other'))
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)

@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import fmean, stdev
 from typing import Iterator, Mapping, Sequence
-
-import numpy as np
 
 from dlo_calibration.experiment.outcome import Outcome
 from dlo_calibration.experiment.study import Task
@@ -32,8 +31,8 @@ class Spread:
         """Return the spread of numbers; None if there are none."""
         if not numbers:
             return None
-        return cls(float(np.mean(numbers)), float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None,
-                   len(numbers))
+        # Not NumPy's: it gives numbers that are all the same 4e-15.
+        return cls(fmean(numbers), stdev(numbers) if len(numbers) > 1 else None, len(numbers))
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def run_score(found: Sequence[tuple[Task, Outcome]]) -> float | None:
 
 def _mean(numbers: Sequence[float | None]) -> float | None:
     known = [one for one in numbers if one is not None]
-    return float(np.mean(known)) if known else None
+    return fmean(known) if known else None
 
 
 def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:

@@ -31,6 +31,11 @@ def test_the_numbers_are_those_of_the_runs():
     assert found.fitted.mean == pytest.approx(0.002)
 
 
+def test_a_default_that_is_kept_in_all_runs_does_not_scatter():
+    assert Spread.of([23.788672241957592] * 20) == Spread(23.788672241957592, 0.0, 20)
+    assert Spread.of([23.8]) == Spread(23.8, None, 1)
+
+
 def test_a_parameter_may_be_told_in_some_runs_only():
     found = summary([*outcomes(1, 60.0, (1.0, 1.0), ('friction', 'elasticity')),
                      *outcomes(2, 70.0, (1.0, 1.0))])
