@@ -34,6 +34,8 @@ def end_at_signals(program: str) -> None:
     Child processes that simulate end with this one.
     """
     def end(number: int, frame: FrameType | None) -> None:
+        for other in SIGNALS:
+            signal.signal(other, signal.SIG_IGN)  # a second one would end it again, with a second line
         for one in _cleaners:
             one()
         try:

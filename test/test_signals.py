@@ -54,6 +54,27 @@ def test_a_signal_ends_it_with_one_line_and_no_unfinished_file(tmp_path, number,
     assert [path.name for path in tmp_path.iterdir()] == ([] if work == 'write' else ['.begun'])
 
 
+SECOND = """
+import os, signal
+from dlo_calibration.signals import end_at_signals
+write = os.write
+def written(number, octets):
+    write(number, octets)
+    os.write = write
+    os.kill(os.getpid(), signal.SIGTERM)
+os.write = written
+end_at_signals('dlo-calibration')
+os.kill(os.getpid(), signal.SIGINT)
+signal.pause()
+"""
+
+
+def test_a_second_signal_while_the_first_one_ends_it_adds_no_line():
+    done = subprocess.run([sys.executable, '-c', SECOND], capture_output=True, text=True, timeout=PATIENCE,
+                          env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, 'dlo-calibration: interrupted\n')
+
+
 @pytest.mark.parametrize('words', [(), ('--json',)])
 def test_a_full_standard_output_is_told_in_one_line(words):
     with open('/dev/full', 'w') as full:

@@ -17,6 +17,7 @@ import subprocess
 import time
 
 from domain import ros_graph
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 from tally import peak_of, Tally
@@ -73,7 +74,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
         read_session(session_folder)
         heard, tally.refused = _recorded(session_folder)
         tally.lost = abs(sent - heard - tally.refused)
-    except (InputError, ValueError):
+    except (InputError, ValueError, McapError):  # as of a node that was killed
         tally.lost = sent
     return tally
 

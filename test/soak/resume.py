@@ -190,7 +190,8 @@ def of_node(folder: Path, tally: Tally, choose: random.Random) -> None:
                 robot.until(lambda robot=robot, wanted=wanted, seen=seen: seen() >= wanted
                             or robot.status['state'] == 'done')
                 node.kill()
-                told = seen()
+                finished = robot.heard['result'] or robot.status['state'] == 'done'
+                told = 0 if finished else seen()  # a finished calibration keeps no log
                 continue
             details = functools.partial(map, lambda one: values(one.status[0])['detail'])
             results.append(robot.until_result())
