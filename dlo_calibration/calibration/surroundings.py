@@ -84,8 +84,8 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
         if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the found values stay
             found, again = replace(found, excited=found.excited | (point != best.point)), best
     assert again.residuals is not None
-    left = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
-    return replace(examination, uncertainty=found.at(best.point, again.point, left)), again
+    remaining = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
+    return replace(examination, uncertainty=found.at(best.point, again.point, remaining)), again
 
 
 def _step(fit: Linearisation, found: Uncertainty) -> Floats:

@@ -35,8 +35,8 @@ class Observed:
     """
     The trials of a DLO, and the options to simulate them with.
 
-    :param options: `calibrate` is decided from all trials if it is open, so that leaving one out does not
-        change it.
+    :param options: if `calibrate` is auto, all trials decide it, so that each calibration finds the same
+        parameters, whichever trial is left out.
     """
 
     trials: tuple[Trial, ...]

@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Iterator, Mapping, Sequence
+
+import numpy as np
 
 from dlo_calibration.experiment.outcome import Outcome
 from dlo_calibration.experiment.study import Task
@@ -31,8 +33,8 @@ class Spread:
         """Return the spread of numbers; None if there are none."""
         if not numbers:
             return None
-        # Not NumPy's: it gives numbers that are all the same 4e-15.
-        return cls(fmean(numbers), stdev(numbers) if len(numbers) > 1 else None, len(numbers))
+        away = np.subtract(numbers, numbers[0])  # exactly 0 where all are the same, which the mean may not be
+        return cls(fmean(numbers), float(np.std(away, ddof=1)) if len(numbers) > 1 else None, len(numbers))
 
 
 @dataclass(frozen=True)

@@ -92,8 +92,8 @@ def markdown(account: Account) -> str:
     parts = [
         '# Consistency and validity', f'`{account.command}`',
         f'{account.runs} runs of each object and search, each with its own random seed; engine '
-        f'{account.engine}. At most as many evaluations per calibration: '
-        f'{", ".join(f"{search} {count}" for search, count in account.evaluations.items())}.']
+        f'{account.engine}. A calibration has at most '
+        f'{", ".join(f"{count} evaluations ({search})" for search, count in account.evaluations.items())}.']
     if not account.complete:
         parts.append('**Not complete**: the tables show the runs that are done; '
                      'the same command continues with the others.')

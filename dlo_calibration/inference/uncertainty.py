@@ -113,7 +113,7 @@ class Uncertainty:
             covariance=None if self.covariance is None else
             frozen_array(self.covariance * np.outer(wider, wider)))
 
-    def at(self, point: Floats, there: Floats, left: Floats) -> Uncertainty:
+    def at(self, point: Floats, there: Floats, remaining: Floats) -> Uncertainty:
         """
         Return the uncertainty at another point, which may not be quite a minimum.
 
@@ -122,12 +122,12 @@ class Uncertainty:
 
         :param point: (d,) that this is the uncertainty at.
         :param there: (d,) the other point.
-        :param left: (d,) how far the minimum is from it.
+        :param remaining: (d,) how far the minimum is from it.
         """
-        std = np.minimum(np.hypot(self.std, left), UNKNOWN_STD)
+        std = np.minimum(np.hypot(self.std, remaining), UNKNOWN_STD)
         wider, covariance = std / self.std, self.covariance
         if covariance is not None:
-            covariance = covariance + np.outer(left, left)
+            covariance = covariance + np.outer(remaining, remaining)
             shrink = np.minimum(1.0, std / np.sqrt(np.diag(covariance)))
             covariance = frozen_array(covariance * np.outer(shrink, shrink))
         lower = np.maximum(there - wider * (point - self.lower), 0.0)

@@ -17,7 +17,7 @@ from dlo_calibration.calibration.automatic import BETWEEN_CLAMPS, choose, IN_MOT
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.identity import calibration_digest
 from dlo_calibration.calibration.live_information import LiveInformation
-from dlo_calibration.experiment.study import Observed, Subject, Task
+from dlo_calibration.experiment.study import Observed
 from dlo_calibration.files.result import read_result, write_result
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.report.terminal import print_result
@@ -112,14 +112,6 @@ def test_trials_are_appraised_with_the_parameters_that_they_show():
 def test_an_experiment_finds_the_same_parameters_whichever_trial_is_left_out():
     observed = Observed((*toy_trials(2), in_motion()), Options())
     assert observed.options.calibrate == (*PAPER_PARAMETERS, *IN_MOTION)
-
-
-def test_an_experiment_gives_each_search_its_own_number_of_evaluations():
-    subject = Subject('rope', Observed(tuple(toy_trials(3)), Options()), (0,))
-    for search, most in (('random', PAPER_ROUNDS), ('least_squares', PAPER_ROUNDS + REFINEMENT)):
-        for left_out in (None, 0):
-            task = Task(subject, search, 7, 'toy', left_out)
-            assert (task.options.search, task.options.seed, task.options.evaluations) == (search, 7, most)
 
 
 def test_a_stream_between_clamps_gives_its_parameters_back():

@@ -95,6 +95,7 @@ def test_the_json_document_is_the_file_and_tells_the_truth_that_was_found(run, s
     assert code == 0
     assert found == json.loads((tmp_path / 'out' / 'experiment.json').read_text())
     assert found['complete']
+    assert found['evaluations'] == {'least_squares': 150 + 400}
     one, = found['findings']
     means = {name: spread['mean'] for name, spread in one['parameters'].items()}
     assert means == pytest.approx(TRUTH, abs=0.5)

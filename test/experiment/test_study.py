@@ -12,6 +12,7 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
+from dlo_calibration.calibration.automatic import PAPER_ROUNDS, REFINEMENT
 from dlo_calibration.calibration.calibrate import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
@@ -35,6 +36,13 @@ def subject(count=3, held_back=None, others=None, options=OPTIONS, name='rope'):
 
 def task(left_out=None, search='random', seed=1, engine='toy', **about):
     return Task(subject(**about), search, seed, engine, left_out)
+
+
+def test_each_search_has_a_number_of_evaluations_of_its_own():
+    for search, most in (('random', PAPER_ROUNDS), ('least_squares', PAPER_ROUNDS + REFINEMENT)):
+        for left_out in (None, 0):
+            options = task(left_out, search, 7, options=Options()).options
+            assert (options.search, options.seed, options.evaluations) == (search, 7, most)
 
 
 def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back():

@@ -3,6 +3,8 @@
 
 """The summary of an experiment: its numbers are those of known outcomes."""
 
+import math
+
 import numpy as np
 from outcomes import outcomes, ROPE
 import pytest
@@ -34,6 +36,7 @@ def test_the_numbers_are_those_of_the_runs():
 def test_a_default_that_is_kept_in_all_runs_does_not_scatter():
     assert Spread.of([23.788672241957592] * 20) == Spread(23.788672241957592, 0.0, 20)
     assert Spread.of([23.8]) == Spread(23.8, None, 1)
+    assert math.isnan(Spread.of([1.0, math.nan]).std)
 
 
 def test_a_parameter_may_be_told_in_some_runs_only():
