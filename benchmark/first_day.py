@@ -268,10 +268,9 @@ def main() -> None:
                    'ROS_LOG_DIR': str(folder / 'log')}
     sys.setswitchinterval(0.0005)  # as the node: these threads shall not be what is waited for
     rclpy.init()
-    fresh = {**os.environ, 'NUMBA_CACHE_DIR': str(folder / 'numba'), 'XDG_CACHE_HOME': str(folder / 'cache')}
     day = Day(chosen.minutes)
     child = subprocess.Popen([sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args',
-                              '-p', f'mass:={MASS}', '-p', f'output_directory:={folder}'], env=fresh)
+                              '-p', f'mass:={MASS}', '-p', f'output_directory:={folder}'])
     try:
         figures = day.play()
         begun = day.now

@@ -36,7 +36,6 @@ from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares, SEARCHES
 from dlo_calibration.search.random import RandomSearch
-from dlo_calibration.simulation import together  # noqa: F401  # loaded before the first measurement
 
 RESULTS = Path(__file__).resolve().parent / 'results'
 RUNGS = ((31, 0.004), (21, 0.006), (15, 0.009))  # nodes, time step [s]

@@ -3,6 +3,8 @@
 
 """Measure whether the memory in use stays constant over many rollouts: `make bench`."""
 
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 import os
 from pathlib import Path
 
@@ -11,7 +13,6 @@ import numpy as np
 import pytest
 
 from dlo_calibration import SimulationError
-from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.files.session import read_session
 
 #: engine -> rounds
@@ -63,12 +64,9 @@ def rows():
 
 @pytest.mark.parametrize('engine', ROUNDS)
 def test_memory(benchmark, engine, rows):
-    executor = ProcessExecutor(1)
-    try:
+    with ProcessPoolExecutor(1, get_context('spawn')) as executor:
         looks = np.array(benchmark.pedantic(
             lambda: executor.submit(memory, engine, ROUNDS[engine]).result(), rounds=1))
-    finally:
-        executor.close()
     warm = looks[looks[:, 0] > WARM * ROUNDS[engine]]
     slope = np.polyfit(warm[:, 0], warm[:, 1], 1)[0]
     rows.append([engine, ROUNDS[engine], f'{warm[0, 1] / 1000:.1f}', f'{warm[-1, 1] / 1000:.1f}',

@@ -11,11 +11,10 @@ import pytest
 
 from dlo_calibration import Action, Chain, Goal, Hand, read_session, Trial
 from dlo_calibration.model.parameters import knot_names, ParameterSpace
-from dlo_calibration.simulation import entries, rope
+from dlo_calibration.simulation import core
 from dlo_calibration.simulation.bullet import BulletSimulator
-from dlo_calibration.simulation.compiled import CompiledRope, CompiledSimulator
-from dlo_calibration.simulation.engine import Engine
-from dlo_calibration.simulation.kernel_cache import compile_kernels, KERNELS
+from dlo_calibration.simulation.compiled import CompiledSimulator, NO_TABLE
+from dlo_calibration.simulation.protocol import Simulator, Stop
 
 NODES = (12, 30, 60, 120)
 ROUNDS = 7
@@ -28,9 +27,6 @@ TOGETHER = {  # what is simulated -> free parameters
 VALUES = {'flexibility': 66.7, 'friction': 69.7}  # the truth of object 1
 HOW = ('Object 1; a settled round is one trial simulated until the DLO has come to rest. Shortest of '
        f'{ROUNDS} repetitions, in which the engines take turns in one process; its processor time.')
-
-for module in KERNELS:
-    compile_kernels(module)
 
 
 def object1():
@@ -66,15 +62,14 @@ def tables():
         'A cable of 41 nodes that two clamps swing in the air:',
         table(['physics', 'compiled, µs per step', 'relative to plain'], cables),
         'What a compiled round is spent on, in µs:',
-        table(['nodes', 'whole', 'Python', 'table of distances', 'self-contact', 'rod and table',
-               'Python, share', 'self-contact, share'], parts)]))
+        table(['nodes', 'whole', 'core', 'Python', 'Python, share'], parts)]))
 
 
 @pytest.mark.benchmark(timer=time.process_time)
 @pytest.mark.parametrize('nodes', NODES)
 def test_settled_rounds(benchmark, nodes, tables):
     trials, physical = object1()
-    engines: dict[str, Engine] = {
+    engines: dict[str, Simulator] = {
         'bullet': BulletSimulator(nodes=nodes), 'compiled': CompiledSimulator(nodes=nodes)}
     steps = {name: sum(engine.simulate(trial, physical).steps for trial in trials)
              for name, engine in engines.items()}
@@ -91,7 +86,7 @@ def test_settled_rounds(benchmark, nodes, tables):
 @pytest.mark.parametrize('number', range(len(ACTIONS)), ids=ACTIONS)
 def test_trial(benchmark, number, tables):
     trials, physical = object1()
-    engines: dict[str, Engine] = {'bullet': BulletSimulator(), 'compiled': CompiledSimulator()}
+    engines: dict[str, Simulator] = {'bullet': BulletSimulator(), 'compiled': CompiledSimulator()}
     steps = {name: engine.simulate(trials[number], physical).steps for name, engine in engines.items()}
     seconds = side_by_side(benchmark, {
         name: lambda engine=engine: engine.simulate(trials[number], physical)
@@ -112,15 +107,19 @@ def test_cables(benchmark, tables):
     friction = {'bending_friction': 1.0, 'bending_slip': 0.1}
     swing = np.sin(np.linspace(0, np.pi, count + 1))[1:, None, None] * np.array(
         [(0, 0.1, 0), (0, 0.1, 0), (-0.2, 0, 0.1), (-0.2, 0, 0.1)])
-    turns = np.tile(np.eye(3).reshape(9), (count, 4, 1))
-    ropes = {}
-    for name, more in {'plain': {}, 'natural curvature': {'natural_curvature': 2.0}, 'material frame': frame,
-                       'friction between strands': friction, 'all of it': {**frame, **friction}}.items():
-        ropes[name] = CompiledRope(places, points, np.zeros_like(points), {**plain, **more}, 0.003)
-        ropes[name].hold(held)
-    targets = points[held] + swing
-    seconds = side_by_side(benchmark, {name: lambda rope=rope: rope.advance(targets, turns=turns)
-                                       for name, rope in ropes.items()}, 10 * ROUNDS)
+    turns = np.tile(np.eye(3).reshape(9), (count, 1))
+    start = core.Start(places, points, np.zeros_like(points))
+    grips = [core.Grip([k], points[node] + swing[:, k], None, turns)
+             for k, node in enumerate(held)]
+    script = core.Script([
+        *(core.Event.close(k, [node], points[node]) for k, node in enumerate(held)),
+        core.Event.hold(held), core.Event.advance(grips, count)], 0.001, 100)
+    cables = {name: {**plain, **more} for name, more in {
+        'plain': {}, 'natural curvature': {'natural_curvature': 2.0}, 'material frame': frame,
+        'friction between strands': friction, 'all of it': {**frame, **friction}}.items()}
+    seconds = side_by_side(benchmark, {
+        name: lambda physical=physical: core.roll_out([(script, start, physical, NO_TABLE)], 0.003)
+        for name, physical in cables.items()}, 10 * ROUNDS)
     tables[3].extend([name, f'{1e6 * taken / count:.1f}', f'{taken / seconds["plain"]:.2f}']
                      for name, taken in seconds.items())
 
@@ -144,63 +143,38 @@ def test_together(benchmark, name, tables):
     sets = [space.physical(space.values(random.random(len(space.free))), 0.6) for _ in range(SETS)]
     jobs = [(trial, physical) for physical in sets for trial in trials]
     steps = sum(simulator.simulate(*job).steps for job in jobs)
-    simulator.simulate_together(jobs)
+    simulator.simulate_together(jobs, Stop())
     seconds = side_by_side(benchmark, {'alone': lambda: [simulator.simulate(*job) for job in jobs],
-                                       'together': lambda: simulator.simulate_together(jobs)}, ROUNDS)
+                                       'together': lambda: simulator.simulate_together(jobs, Stop())}, ROUNDS)
     rates = [len(jobs) / one for one in seconds.values()]
     tables[4].append([name, len(jobs), *(f'{rate:.0f}' for rate in rates), f'{rates[1] / rates[0]:.2f}',
                       *(f'{1e6 * one / steps:.2f}' for one in seconds.values())])
 
 
-class Watch:
-    """Stands in for a kernel, calls it, and measures its time."""
-
-    def __init__(self, kernel, prepare=lambda arguments: None):
-        self.kernel, self.prepare, self.seconds = kernel, prepare, 0.0
-
-    def __call__(self, *arguments):
-        self.prepare(arguments)
-        begun = time.process_time()
-        try:
-            return self.kernel(*arguments)
-        finally:
-            self.seconds += time.process_time() - begun
-
-
-def look_for_no_contact(arguments):
-    """Change the rope of `entries.advance` so that it checks no pair of segments for contact."""
-    contact = arguments[0].state.contact
-    contact.room[:] = np.inf
-
-
 @pytest.mark.benchmark(timer=time.process_time)
 @pytest.mark.parametrize('nodes', NODES)
 def test_parts(benchmark, nodes, tables, monkeypatch):
-    """Measure kernels where Python calls them, and self-contact as the time saved without it."""
+    """Measure the core where Python calls it."""
     trials, physical = object1()
-    simulator = CompiledSimulator(nodes=nodes)
-    advance, start = entries.advance, rope.start_distances
-    whole, kernel, distances, contact = [], [], [], []
+    simulator, roll_out = CompiledSimulator(nodes=nodes), core.roll_out
+    whole, inside = [], []
 
-    def measure(prepare=lambda arguments: None):
-        watches = Watch(advance, prepare), Watch(start)
-        monkeypatch.setattr(entries, 'advance', watches[0])
-        monkeypatch.setattr(rope, 'start_distances', watches[1])
+    def watched(*arguments):
         begun = time.process_time()
-        steps = sum(simulator.simulate(trial, physical).steps for trial in trials)
-        return time.process_time() - begun, *(watch.seconds for watch in watches), steps
+        try:
+            return roll_out(*arguments)
+        finally:
+            inside[-1] += time.process_time() - begun
 
     def take():
-        total, stepping, starting, steps = measure()
-        _, free, _, free_steps = measure(look_for_no_contact)
-        whole.append(total)
-        kernel.append(stepping)
-        distances.append(starting)
-        contact.append(stepping - free * steps / free_steps)
+        inside.append(0.0)
+        begun = time.process_time()
+        for trial in trials:
+            simulator.simulate(trial, physical)
+        whole.append(time.process_time() - begun)
 
-    benchmark.pedantic(take, rounds=2 * ROUNDS)
-    total, stepping, starting, touching = (1e6 * float(np.median(x)) / len(trials)
-                                           for x in (whole, kernel, distances, contact))
-    python = total - stepping - starting
-    tables[2].append([nodes, *(f'{x:.0f}' for x in (total, python, starting, touching, stepping - touching)),
-                      *(f'{x / total:.0%}' for x in (python, touching))])
+    monkeypatch.setattr(core, 'roll_out', watched)
+    benchmark.pedantic(take, rounds=2 * ROUNDS, warmup_rounds=1)
+    total, stepping = (1e6 * float(np.median(x)) / len(trials) for x in (whole, inside))
+    tables[2].append([nodes, *(f'{x:.0f}' for x in (total, stepping, total - stepping)),
+                      f'{1 - stepping / total:.0%}'])

@@ -14,7 +14,7 @@ from figures import HERE, SAMPLES, table, write
 import pytest
 
 ROUNDS = 5
-SLOW = ('numpy', 'scipy', 'scipy.spatial', 'scipy.optimize', 'matplotlib', 'numba', 'pybullet', 'rclpy')
+SLOW = ('numpy', 'scipy', 'scipy.spatial', 'scipy.optimize', 'matplotlib', 'pybullet', 'rclpy')
 COMMANDS = {
     'dlo-calibration --help': ('dlo_calibration', '--help'),
     'dlo-calibration info SESSION': ('dlo_calibration', 'info', str(SAMPLES / 'object1')),
@@ -22,21 +22,21 @@ COMMANDS = {
     'calibrator, until it is ready': ('dlo_calibration.ros.calibrator',),
 }
 FIT = ('first simulation begins', 'first evaluation kept', 'result printed', 'page and all files written')
-#: executes the command, and notes when its processes get the first evaluation to simulate
+#: executes the command, and notes when its threads get the first evaluation to simulate
 NOTING = """
 import sys, time
 from dlo_calibration.__main__ import main
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation.pool import Threads
 
-submit, note = ProcessExecutor.submit, sys.argv.pop()
+submit, note = Threads.submit, sys.argv.pop()
 
 def noting(*words, **more):
-    ProcessExecutor.submit = submit
+    Threads.submit = submit
     with open(note, 'w') as file:
         file.write(repr(time.time()))
     return submit(*words, **more)
 
-ProcessExecutor.submit = noting
+Threads.submit = noting
 sys.exit(main())
 """
 READY = 'collecting trials'  # says the node
@@ -85,7 +85,7 @@ def rows():
     yield found
     if found:
         write('startup', 'make bench', f'Wall clock from the start of the process; shortest of {ROUNDS} '
-              f'repetitions, after one that compiles the kernels if they are not. Loaded of '
+              f'repetitions. Loaded of '
               f'{", ".join(SLOW)}, as `python -X importtime` says.',
               table(['command', 'seconds', 'loads'], found))
 

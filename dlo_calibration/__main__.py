@@ -3,7 +3,6 @@
 
 """The executable `dlo-calibration`, which handles signals before it loads anything large."""
 
-import gc
 import os
 import sys
 
@@ -12,24 +11,12 @@ from dlo_calibration.signals import end_at_signals, StopFlag
 NAME = 'dlo_calibration'
 
 
-def begin_to_load() -> None:
-    """Let the processes that are going to simulate load the kernels while this one reads its input."""
-    from dlo_calibration.evaluation import processes
-
-    words = f'{" ".join(sys.argv)} '.replace('=', ' ')
-    if processes.cores() > 1 and ' --workers 1 ' not in words:
-        processes.begin_to_load()
-
-
 def main() -> int:
     """Execute the command line of the process; return the exit code, as `cli.main.main` does."""
     end_at_signals('dlo-calibration')
-    gc.set_threshold(50_000, 20, 20)  # what is being loaded is no garbage, and looking through it takes long
     # Where they were closed by whoever started the process, Python has none.
     sys.stdout, sys.stderr = (stream or open(os.devnull, 'w') for stream in (sys.stdout, sys.stderr))
     try:
-        if sys.argv[1:2] == ['fit'] and any(map(os.path.exists, sys.argv[2:])):
-            begin_to_load()
         from dlo_calibration.cli.main import main as execute
         from dlo_calibration.cli.output import flush
 
@@ -45,7 +32,6 @@ def main() -> int:
         return 2
     finally:
         StopFlag().ignore()  # what there was to do is done
-        gc.freeze()  # else Python looks for garbage among all objects before it ends, for a tenth of a second
 
 
 if __name__ == '__main__':

@@ -29,6 +29,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from dlo_calibration import Action, Chain, Hand
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.files.result import read_description
 from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.planning.rehearsal import Job, rehearse, Step
@@ -56,7 +57,7 @@ class SimulatedRobot:
         height = options.table_height + posterior.best['self_collision']
         self.start = Chain(arc(found.length, height, 0.0, (0.3, 0.0)))
         self.physical = posterior.lying(self.start, options).draws(1, seed=2)[0]
-        self.simulator = make_simulator(replace(options, nodes=NODES // 2 + 1)).refined()
+        self.pool = Pool(make_simulator(replace(options, nodes=NODES // 2 + 1)).refined())
         self.steps, self.points = [], self.start.points
         self.generator = np.random.default_rng(1)
         self.tracker = node.create_publisher(PointCloud2, '/planner/chain', 10)
@@ -79,7 +80,7 @@ class SimulatedRobot:
             hands.append(Hand(name, (grip,), np.array(times), path))
         self.steps.append(Step(Action(tuple(hands))))
         # From the very start each time, as a chain alone does not tell how much the rope is stretched.
-        found, = rehearse(self.simulator, [
+        found, = rehearse(self.pool, [
             Job(self.start, tuple(self.steps), self.physical, courses=True)])
         course = (*found.courses[-1], found.chains[-1])
         for self.points in course:

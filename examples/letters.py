@@ -31,7 +31,7 @@ from scipy.optimize import lsq_linear
 from dlo_calibration import calibrate, Chain, Options, plan, PlanOptions, read_session
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.experiment.known_dlos import KNOWN_DLOS, KnownDlo
 from dlo_calibration.experiment.pairs import POINTS, seen
 from dlo_calibration.experiment.reality import Reality
@@ -151,7 +151,7 @@ def calibrated(dlo: KnownDlo) -> CalibrationResult:
     return calibrate(session_trials(session, options)[0], options)
 
 
-def laid(letter: str, executor: ProcessExecutor) -> Laid:
+def laid(letter: str) -> Laid:
     """Lay a rope into a letter."""
     name, corners = LETTERS[letter]
     dlo = next(one for one in KNOWN_DLOS if one.name == name)
@@ -167,7 +167,7 @@ def laid(letter: str, executor: ProcessExecutor) -> Laid:
         reality, chains, actions = Reality(dlo, Chain(start), simulator), [start], []
         for k in range(MOST_ACTIONS):
             camera = Chain(seen(reality.points) + random.normal(0, NOISE, (len(seen(start)), 3)))
-            steps = plan(found, camera, Chain(seen(goal)), options, executor=executor)
+            steps = plan(found, camera, Chain(seen(goal)), options)
             if not steps.actions:
                 break
             reality.act(steps.actions[0].action)
@@ -176,7 +176,7 @@ def laid(letter: str, executor: ProcessExecutor) -> Laid:
             left = error(reality.points, goal, dlo)
             sys.stdout.write(f'{letter}, action {k + 1}: {left:.2f} % of the length from the goal\n')
             sys.stdout.flush()
-        laid, = rehearse(simulator, [Job(Chain(start), reality.steps, dlo.physical, courses=True)])
+        laid, = rehearse(Pool(simulator), [Job(Chain(start), reality.steps, dlo.physical, courses=True)])
     return Laid(letter, dlo, goal, np.stack(chains), tuple(error(one, goal, dlo) for one in chains),
                 tuple(actions), laid.courses)
 
@@ -190,11 +190,7 @@ def main() -> int:
     """Lay and draw the letters."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else os.curdir)
     folder.mkdir(parents=True, exist_ok=True)
-    executor = ProcessExecutor(0)
-    try:
-        found = [laid(letter, executor) for letter in LETTERS]
-    finally:
-        executor.close()
+    found = [laid(letter) for letter in LETTERS]
     draw_letters(found, folder / 'letters.png')
     draw_film(found, folder / 'letters.gif')
     return 0

@@ -29,16 +29,14 @@ ONLY = {
     'pybullet': ('simulation/bullet_world.py', 'simulation/window.py'),
     'cv2': ('capture',),
     'PIL': ('capture', 'report/animation.py'),
-    'numba': ('simulation/lanes.py', 'simulation/compilation.py'),
-    'llvmlite': ('simulation/lanes.py', 'simulation/compilation.py', 'simulation/machine_code.py'),
     'cma': ('search/cma_es.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
     'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py', 'simulation/window.py'),
-    'dlo_calibration.simulation.compiled': ('calibration/engines.py', 'simulation/together.py'),
+    'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
 }
 
-NOT_LOADED = ('aiohttp', 'cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'numba', 'distributed', 'matplotlib',
+NOT_LOADED = ('aiohttp', 'cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'distributed', 'matplotlib',
               'scipy.optimize', 'cma')
 
 FILES = sorted(FOLDER.rglob('*.py'))
@@ -112,12 +110,12 @@ def test_a_search_never_sees_a_trial():
 
 
 #: What takes long to load; then commands of one process, and what of that they need.
-SLOW = {'jinja2', 'matplotlib', 'numba', 'pybullet', 'rclpy', 'scipy'}
+SLOW = {'jinja2', 'matplotlib', 'pybullet', 'rclpy', 'scipy'}
 LOADED = (
     ((['info', 'msg_samples/object1'], ['info', 'msg_samples/xml/named_actions.xml'], ['--help']), set()),
     ((['plot', 'msg_samples/xml/push_and_release.xml'],), {'matplotlib'}),
     ((['fit', 'msg_samples/object1', *'--workers 2 --calibrate friction --evaluations 4'.split()],),
-     {'pybullet'}),
+     set()),
 )
 
 
@@ -157,7 +155,6 @@ from {PACKAGE}.simulation.compiled import CompiledSimulator
 from {PACKAGE}.calibration.options import Options
 from {PACKAGE}.files.session import read_session, session_trials
 trials, _ = session_trials(read_session('msg_samples/object1'), Options())
-# With a rest shape, kernels call the functions of C's library.
 CompiledSimulator().simulate(trials[0], ParameterSpace().physical({{'natural_curvature': 60.0}}, 0.6))
 print(*sys.modules)
 """

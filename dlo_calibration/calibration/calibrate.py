@@ -21,14 +21,14 @@ from dlo_calibration.calibration.prior import Prior, prior
 from dlo_calibration.calibration.refinement import refine
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.calibration.stages import advised, confirmed, confirming, with_missing_parameters
+from dlo_calibration.calibration.stages import advised, confirming, second_engine, with_missing_parameters
 from dlo_calibration.calibration.surroundings import examined
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.evaluation.memory import Memory
-from dlo_calibration.evaluation.processes import cores, ProcessExecutor
+from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.plausibility import implausible_trials
 from dlo_calibration.search import SEARCHES
@@ -45,12 +45,12 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
     Find the parameter set whose simulation fits the trials best, and how certain each parameter is.
 
     The code below names the stages in their order. The same trials, options and seed give the same result,
-    bit for bit, for any number of processes. The node and the command line call this function, too.
+    bit for bit, for any number of threads. The node and the command line call this function, too.
 
     :param options: see `Options`; None: the defaults.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
     :param on_notice: called immediately, from any thread, with a sentence about a failure that did not end
-        the calibration, such as a process that died; `CalibrationResult.warnings` contains it, too.
+        the calibration, such as a machine that was lost; `CalibrationResult.warnings` contains it, too.
     :param should_stop: asked often; once True, every stage ends, and the result is the best so far.
     :param make_simulator: makes the engine that `options` name; called in this thread.
     :param log: each finished evaluation is written to it, and none in it is simulated again: after an
@@ -73,19 +73,19 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         on_notice(text)
 
     with ExitStack() as stack:
-        executor = _executor(options, notice, on_notice)  # its processes start while the engine is being made
-        if executor is not None:
-            stack.callback(executor.close)
         simulator = stack.enter_context(closing(make_simulator(options)))
-        if executor is not None:
-            simulator.prepare()
+        second = stack.enter_context(second_engine(options, make_simulator, simulator.name))
+        executor = stack.enter_context(closing(
+            ClusterExecutor(options.scheduler, notice, on_notice) if options.scheduler else
+            Threads(options.workers)))
         memory = Memory(log, engine_digest(options) if log is not None else '', on_notice)
         setting = Setting(tuple(trials), options, simulator, executor, should_stop, on_evaluation, memory)
+        stack.callback(setting.pool.stop)
         result = fitted(setting)
-        ahead = confirming(result, options, make_simulator, None if options.scheduler else executor)
+        confirm = stack.enter_context(confirming(result, second, should_stop, memory))
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
-        result = confirmed(result, options, make_simulator, should_stop, memory, ahead)
+        result = confirm(result)
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
     return replace(result, choice=choice, doubts=doubts, warnings=(*doubts, *result.warnings, *noticed),
                    seconds=clock() - begun)
@@ -116,12 +116,3 @@ def searched(setting: Setting, known: Prior) -> Fit:
         return fit(setting, known.space, search, options.evaluations)
     uniform = fit(setting, known.space, search, min(options.evaluations, budget(known.space.dimension)))
     return refine(setting, uniform, options.evaluations)
-
-
-def _executor(options: Options, on_death: Callable[[str], None],
-              on_wait: Callable[[str], None]) -> ProcessExecutor | ClusterExecutor | None:
-    """Return the executor that simulates evaluations; None: this thread does."""
-    if options.scheduler:
-        return ClusterExecutor(options.scheduler, on_death, on_wait)
-    workers = min(options.workers or cores(), options.evaluations)
-    return ProcessExecutor(workers, on_death, options.answer_limit) if workers > 1 else None

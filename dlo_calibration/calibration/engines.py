@@ -6,26 +6,41 @@
 from __future__ import annotations
 
 import functools
+from importlib.util import find_spec
 import logging
-from multiprocessing import parent_process
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, Mapping, Sequence, TYPE_CHECKING
 
 from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError, printable
-from dlo_calibration.evaluation.apart import SimulatorApart
+from dlo_calibration.evaluation.process_simulator import ProcessSimulator
 from dlo_calibration.simulation.protocol import Simulator
+
+if TYPE_CHECKING:
+    from dlo_calibration.simulation.obstacles import Obstacle
 
 SimulatorFactory = Callable[[Options], Simulator]
 
 
+class NoPyBullet(InputError):
+    """PyBullet is needed, and not installed."""
+
+
 def _bullet(options: Options) -> Simulator:
+    from dlo_calibration.simulation.obstacles import read_scene
+
+    content = f'scene {options.scene}' if options.scene else 'trials'
+    if find_spec('pybullet') is None:
+        raise NoPyBullet(content if options.scene else 'engine bullet', 'PyBullet is not installed',
+                         'that library', 'install it: pip install pybullet')
+    obstacles = read_scene(options.scene) if options.scene else ()
+    return ProcessSimulator('bullet', functools.partial(_bullet_here, engine_settings(options), obstacles),
+                            content, options.answer_limit)
+
+
+def _bullet_here(settings: Mapping[str, Any], obstacles: Sequence[Obstacle]) -> Simulator:
     from dlo_calibration.simulation.bullet import BulletSimulator
 
-    simulator = BulletSimulator(**engine_settings(options), scene=options.scene)
-    if not options.scene or parent_process() is not None:  # a worker's process is one of its own already
-        return simulator
-    # A scene may come from a stranger: what it does to PyBullet must not end the node or the command.
-    return SimulatorApart(simulator, f'scene {options.scene}', options.answer_limit)
+    return BulletSimulator(obstacles=obstacles, **settings)
 
 
 def _compiled(options: Options) -> Simulator:
@@ -40,7 +55,7 @@ def _compiled(options: Options) -> Simulator:
 def _auto(options: Options) -> Simulator:
     """Return the compiled engine, or Bullet with a warning if there is a scene."""
     if options.scene:
-        _warn_once('PyBullet simulates the evaluations, about 50 times slower, because engine compiled does '
+        _warn_once('PyBullet simulates the evaluations, about 60 times slower, because engine compiled does '
                    f'not support a scene: {options.scene}')
         return _bullet(options)
     return _compiled(options)

@@ -61,7 +61,7 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
     """
     Evaluate the parameter sets that a search asks for, until it ends, its budget is spent, or it is stopped.
 
-    The outcome does not depend on the number of processes: the search receives evaluations in the order in
+    The outcome does not depend on the number of threads: the search receives evaluations in the order in
     which it asked for them.
 
     :param budget: largest number of evaluations.

@@ -14,6 +14,7 @@ from dlo_calibration.calibration.engines import engine_settings
 from dlo_calibration.calibration.options import names_of, Options
 from dlo_calibration.evaluation.log import digest
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.core import _core
 
 #: Rooms whose code decides what an evaluation gives: another version of them may give something else.
 DECISIVE = ('model', 'observation', 'simulation', 'evaluation')
@@ -50,4 +51,5 @@ def _scene(path: str) -> tuple[object, ...]:
 
 def _code() -> str:
     package = Path(__file__).parents[1]
-    return digest(*(file.read_bytes() for room in DECISIVE for file in sorted((package / room).glob('*.py'))))
+    files = [file for room in DECISIVE for file in sorted((package / room).glob('*.py'))]
+    return digest(*(file.read_bytes() for file in (*files, Path(_core.__file__))))

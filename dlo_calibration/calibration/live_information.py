@@ -1,17 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-LiveInformation: how much each new trial adds, computed in the background before a calibration.
-
-It simulates in a process of its own, because PyBullet holds the interpreter's lock, and because a process can
-be ended in the middle of a simulation when a calibration begins or the trials are deleted.
-"""
+"""LiveInformation: how much each new trial adds, computed in the background before a calibration."""
 
 from __future__ import annotations
 
 from collections import Counter
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError
 from contextlib import closing
 import json
 import queue
@@ -27,7 +22,7 @@ from dlo_calibration.calibration.prior import prior
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.evaluation.evaluator import mean_length
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.inference.appraiser import Appraiser, Knowledge, without_repeated_goals
 from dlo_calibration.inference.trial_information import TrialInformation
 from dlo_calibration.model.trial import Trial
@@ -141,7 +136,8 @@ class LiveInformation:
             known = Knowledge(known.names, result.best.point, examination.uncertainty)
             kept = list(result.trials)
         with (closing(self._make_simulator(options)) as simulator,
-              closing(ProcessExecutor(1, answer_limit=options.answer_limit)) as process):
+              closing(Threads(1)) as thread):
+            pool = Pool(simulator, thread, job.stop.is_set)
             for k, key in new:
                 trial, fresh = trials[k], key not in informations
                 doubts = implausible(trial, height, bool(options.scene)) if fresh else ()
@@ -149,12 +145,12 @@ class LiveInformation:
                     informations[key] = doubts[0]
                 elif fresh:
                     try:
-                        informations[key] = _result(job, process.submit(_appraised, Appraiser(
-                            space, simulator, mean_length(trials), height, noise(trials), guessed), known,
-                            [*kept, trial]))
+                        informations[key] = Appraiser(
+                            space, pool, mean_length(trials), height, noise(trials), guessed).after(
+                            known, [*kept, trial])
                     except CancelledError:
                         raise
-                    except Exception as error:  # of the engine, or because the process died
+                    except Exception as error:  # of the engine
                         informations[key] = _one_line(error)
                 found = informations[key]
                 if isinstance(found, str):
@@ -165,27 +161,6 @@ class LiveInformation:
                     known, kept = found, [*kept, trial]
                 if fresh:
                     job.found.put(added)
-
-
-def _appraised(appraiser: Appraiser, known: Knowledge, trials: Sequence[Trial]) -> Knowledge:
-    """Return what is known after the last trial; called in the process."""
-    with closing(appraiser.simulator):
-        return appraiser.after(known, trials)
-
-
-def _result(job: _Job, future: Future[Any]) -> Any:
-    """
-    Wait for the result of a future.
-
-    :raises CancelledError: as soon as the job is asked to stop.
-    """
-    while not job.stop.is_set():
-        try:
-            return future.result(timeout=0.05)
-        except TimeoutError:
-            if future.done():
-                raise
-    raise CancelledError
 
 
 def fingerprints(trials: Sequence[Trial]) -> list[tuple[bytes, int]]:

@@ -24,7 +24,6 @@ from dlo_calibration.calibration.declaration import (
     SEARCH,
 )
 from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation.processes import ANSWER_LIMIT
 from dlo_calibration.model.parameters import (
     BY_NAME,
     MOST_PARTS,
@@ -90,14 +89,14 @@ class Options(DeclaredOptions):
     engine: str = declared(
         AUTO, 'simulation engine; auto: search with compiled and confirm the result with bullet, or use '
         'bullet alone if there is a scene', choices=(AUTO, CONFIRMING, 'compiled'), of=SEARCH)
-    workers: int = declared(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
+    workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)
     scheduler: str = declared(
         '', 'address of a Dask scheduler, e.g. tcp://host:8786; its workers then simulate, on any number of '
         'machines, and the option workers has no effect; empty: simulate on this machine', of=MACHINE)
     answer_limit: float = declared(
-        ANSWER_LIMIT, 'time without a sign of life after which a process that simulates is replaced and its '
-        'evaluation is repeated', unit='s', minimum=1.0, maximum=86400.0, of=MACHINE)
+        60.0, 'time without an answer after which a process of PyBullet is replaced and its rollout is '
+        'repeated', unit='s', minimum=1.0, maximum=86400.0, of=MACHINE)
     nodes: int = declared(DEFAULT_NODES, 'number of point masses of the simulated DLO', minimum=8,
                           maximum=1000, of=SEARCH)
     time_step: float = declared(DEFAULT_TIME_STEP, 'simulation time step', unit='s', minimum=0.0001,

@@ -16,8 +16,8 @@ from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.evaluation.executed import Executed
 from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
@@ -32,8 +32,8 @@ class Setting:
 
     :param trials: to calibrate on, at least one; those with the same points get the same rest arc lengths.
     :param options: those that are open are decided from the trials.
-    :param simulator: the engine, which belongs to this thread.
-    :param executor: simulates evaluations in parallel; None: this thread simulates one after the other.
+    :param simulator: the engine.
+    :param executor: its workers simulate; None: one thread.
     :param should_stop: asked often; once True, every stage ends with what it has so far.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
     :param memory: what was simulated before an interruption; every stage asks it first.
@@ -56,33 +56,30 @@ class Setting:
         """Whether cross-validation over the trials chooses the number of parts."""
         return chooses_parts(self.trials, self.options)
 
-    @property
-    def own_simulator(self) -> Simulator:
-        """The engine for stages that simulate other trials; it remembers each rollout."""
-        return self.memory.simulator(self._alone)
+    @cached_property
+    def pool(self) -> Pool:
+        """Simulates for all stages, until they are stopped."""
+        return Pool(self.simulator, self.executor, self.should_stop, self.memory)
 
     def evaluate(self, space: ParameterSpace, trials: tuple[Trial, ...] | None = None,
-                 finer: Simulator | None = None) -> BatchEvaluator:
+                 finer: Pool | None = None) -> BatchEvaluator:
         """
         Return an evaluator of points of a space, by default with the setting's trials and engine.
 
         Its residuals are those of the compared goals.
+
+        :param finer: simulates in place of the setting's pool.
         """
         if trials is None and finer is None:
             return self._usual.of(space, self.memory)
-        evaluator = Evaluator(trials or self.trials, space, finer or self.simulator, every_goal=False)
-        return BatchEvaluator(evaluator, self.should_stop, self.executor,
-                              self.memory.of(evaluator, finer is not None))
-
-    @property
-    def _alone(self) -> Simulator:
-        """The engine; if others simulate evaluations, they simulate for it, several at a time."""
-        return self.simulator if self.executor is None else Executed(self.simulator, self.executor)
+        pool = finer or self.pool
+        evaluator = Evaluator(trials or self.trials, space, pool.simulator, every_goal=False)
+        return BatchEvaluator(evaluator, pool, self.memory.of(evaluator, finer is not None))
 
     @cached_property
     def _usual(self) -> BatchEvaluator:
         return BatchEvaluator(Evaluator(self.trials, self.options.space, self.simulator, every_goal=False),
-                              self.should_stop, self.executor)
+                              self.pool)
 
     def judged(self, space: ParameterSpace, one: Evaluation) -> Evaluation:
         """
@@ -92,12 +89,9 @@ class Setting:
         """
         if compared_rows(self.trials) is None:
             return one
-        evaluator = Evaluator(self.trials, space, self._alone)
-        memory = self.memory.of(evaluator)
-        found = memory.find(one.index, one.point)
-        if found is None:
-            found = evaluator.evaluate(one.index, one.point)
-            memory.add(found)
+        evaluator = Evaluator(self.trials, space, self.simulator)
+        pool = Pool(self.simulator, self.executor, memory=self.memory)  # also after a stop
+        found = evaluator.evaluated(one.index, one.point, pool.simulate(evaluator.jobs(one.point)))
         if found.residuals is None:
             raise SimulationError(found.failure)
         return found

@@ -51,14 +51,14 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
     trials, space, best = setting.trials, fit.space, fit.best
     assert best.residuals is not None
     default, sigma = space.default_point(), noise(trials)
-    finer = setting.simulator.refined()
+    finer = setting.pool.refined()
     noisy = sigma > NO_NOISE and 'length_scale' not in space.free
     evaluate = setting.evaluate(space)
     drawn = with_other_noise(
         trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0)) if noisy else []
     here = best.point[None, :]
     try:
-        # They begin first, as they depend on nothing that follows: processes that would wait do them.
+        # They begin first, as they depend on nothing that follows: threads that would wait do them.
         fine = None if finer is None else setting.evaluate(space, finer=finer).begin(here)
         starts = [setting.evaluate(space, others).begin(here) for others in drawn]
         examination = examine(
@@ -67,7 +67,7 @@ def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
             fading=np.array([name not in REST_SHAPE for name in space.free]))
     finally:
         if finer is not None:
-            finer.close()
+            finer.simulator.close()
     found, jacobian = examination.uncertainty, examination.jacobian
     point, again = np.where(found.excited, best.point, default), best
     if not np.array_equal(point, best.point):

@@ -35,19 +35,16 @@ class Worker(Background[Event]):
         super().__init__('calibration')
         self._make_simulator = make_simulator
 
-    def start(self, trials: Sequence[Trial], options: Options, log: EvaluationLog | None = None,
-              wait: Callable[[Callable[[], bool]], None] = lambda should_stop: None) -> None:
+    def start(self, trials: Sequence[Trial], options: Options, log: EvaluationLog | None = None) -> None:
         """
         Begin to calibrate.
 
         :param log: of finished evaluations, see `calibrate`; it belongs to the calibration until its end.
-        :param wait: called first, e.g. waits for the compiler; it gets a function that tells whether to stop.
         :raises DloCalibrationError: while it is calibrating already.
         """
         trials = tuple(trials)
 
         def work(should_stop: Callable[[], bool]) -> Event:
-            wait(should_stop)
             if log is not None and log.resumed:
                 self.events.put(Notice(log.resumed))
             return calibrate(trials, options, on_evaluation=self.events.put,

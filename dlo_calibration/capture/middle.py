@@ -91,7 +91,7 @@ def fit(pixels: NDArray[np.uint8], rough: Floats, width: float, known: bool, bey
         strength = edges(strip, along * (0.6 if turn == 0 else 1.0))
         table = learn_colours(strip, 0.75, (1.5, 2.4))
         colours = gaussian_filter1d(odds(table, strip.lab), along / 2, axis=0)
-        index, _ = _middles(strip, _evidence(strip, strength, colours), 1.0)
+        index = steady(_scores(strip, _evidence(strip, strength, colours), 1.0)[None], DRIFT)[0][0]
         if turn < TURNS - 1:
             halves = halves * _wider(strip, strength, index)
             line = smoothed(strip.at(strip.offsets[index]), along)
@@ -136,9 +136,9 @@ def _first(pixels: NDArray[np.uint8], line: Floats, width: float, known: bool) -
     colours = gaussian_filter1d(odds(table, strip.lab), 0.3 * width / spacing, axis=0)
     colours *= np.float32(FIRST_COLOUR / COLOUR)
     evidence = _evidence(strip, strength, colours)
-    found = [_middles(strip, evidence, half) for half in halves]
-    best = int(np.argmax([score for _, score in found]))
-    index = found[best][0]
+    found, means = steady(np.stack([_scores(strip, evidence, half) for half in halves]), DRIFT)
+    best = int(np.argmax(means))
+    index = found[best]
     half = float(halves[best]) * width
     return smoothed(strip.at(strip.offsets[index]), half / spacing), half
 
@@ -149,12 +149,6 @@ def _evidence(strip: Strip, strength: Singles, colours: Singles) -> tuple[Single
     saturated = np.minimum(strength / max(FULL * _usual(strip, strength), 1e-6), 1)
     return saturated, np.concatenate(
         [np.zeros((len(colours), 1), np.float32), np.cumsum(colours, axis=1)], axis=1)
-
-
-def _middles(strip: Strip, evidence: tuple[Singles, Singles],
-             half: float) -> tuple[NDArray[np.int64], float]:
-    """Return the index of the middle's offset at each station, and the mean score."""
-    return steady(_scores(strip, evidence, half), DRIFT)
 
 
 def _scores(strip: Strip, evidence: tuple[Singles, Singles], half: float) -> Singles:

@@ -8,8 +8,9 @@ Dijkstra's algorithm over states of pixel and direction.  A move costs more wher
 where the direction changes, so that the way goes straight on at crossings; at a click the next part goes on
 in the directions in which the parts before it arrive.
 
-The kernels are in `path_kernels`.  A state of a ridge of H x W pixels is (v W + u) 16 + the index, in
-`path_kernels.MOVES`, of the move that leads to the pixel u, v.
+Every move costs at least 1, so all states of the frontier that cost less than 1 more than its cheapest are
+settled at once: they form a bucket as wide as the least cost (Dial, Algorithm 360: shortest-path forest with
+topological ordering, 1969), and none of them is reached more cheaply through another.
 """
 
 from __future__ import annotations
@@ -17,97 +18,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.capture.ridge import Ridge
+from dlo_calibration.capture.ridge import Ridge, Singles
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.simulation.kernel_cache import TRACER
-from dlo_calibration.simulation.machine_code import defined_in
-from dlo_calibration.simulation.states import (
-    ByteRows,
-    Bytes,
-    Cube32,
-    Indices,
-    Matrix,
-    Matrix32,
-    Vector,
-    Vector32,
-)
 
-MOST = 2_500_000  # states that are looked at, about a second: along a DLO these are 20 to 400 thousand
-ROOM = 1 << 16  # pixels of all ways to a click for which there is room at first
+Indices = NDArray[np.int64]
 
-
-@defined_in(TRACER)
-def add_scores(scores: Matrix32, drift: float, totals: Matrix, came: ByteRows) -> int:
-    """
-    Find the largest sum of scores to each column of each row.
-
-    :param scores: (n, m).
-    :param drift: see `steady`.
-    :param totals: (2, m) sums up to the last row with an even index, the first row's being given, and up to
-        the last one with an odd index.
-    :param came: (n, m) from how many columns further on the sum to each comes is written here, but to row 0.
-    """
-    raise NotImplementedError
-
-
-@defined_in(TRACER)
-def follow_back(came: ByteRows, index: Indices) -> int:
-    """Write the (n,) columns that lead to the last one, which is given; `came` (n, m) is of `add_scores`."""
-    raise NotImplementedError
-
-
-@defined_in(TRACER)
-def look_beside(place: Vector, reach: float, height: int, width: int, states: Indices,
-                costs: Vector32) -> int:
-    """
-    Find the states around a click, in all directions, and what each costs.
-
-    :param place: (2,) the click [px of the ridge].
-    :param reach: how far it may be from the way [px of the ridge].
-    :param states: room for 16 (2 int(reach) + 3)^2 of them, and `costs` likewise.
-    :returns: how many there are.
-    """
-    raise NotImplementedError
-
-
-@defined_in(TRACER)
-def find_ways(hessian: Cube32, floor: float, goal: Vector, reach: float, left: Indices, begins: Indices,
-              begin_costs: Vector32, cost: Vector32, before: Bytes, heap: Indices, keys: Vector32,
-              touched: Indices, ends: Indices, end_costs: Vector32) -> int:
-    """
-    Find the ways from one click to the next.
-
-    :param hessian: (H, W, 3), and `floor`: see `Ridge`.
-    :param goal: (2,) the next click [px of the ridge].
-    :param reach: how far it may be from the way [px of the ridge].
-    :param left: (1,) how many states may still be looked at.
-    :param begins: (s,) states at the first click; `begin_costs`: their costs.
-    :param cost: (16 H W,) workspace, all inf: cost of the best way to each state.
-    :param before: (16 H W,) the direction in which the way came to the state before is written here for each
-        state that was found, -1 at a begin.
-    :param heap: (s + 4 left,) workspace: states to look at, the cheapest first; `keys`: their costs.
-    :param touched: (16 H W,) workspace: states whose cost is known.
-    :param ends: (e,) room for the states near `goal` at which ways end; `end_costs`: for their costs.
-    :returns: how many there are; 0: none was found within `left`.
-    """
-    raise NotImplementedError
-
-
-@defined_in(TRACER)
-def list_ways(ends: Indices, begins: Indices, before: Bytes, width: int, pixels: Indices, bounds: Indices,
-              links: Indices) -> int:
-    """
-    List the pixels of the ways back from `ends` (e,), one after the other, as far as there is room.
-
-    :param begins: (s,) states at which the ways begin.
-    :param before: (16 H W,) of `find_ways`.
-    :param width: W.
-    :param pixels: (p,) room for the pixels, v W + u.
-    :param bounds: (e + 1,) where each way begins among them, and where the last one ends.
-    :param links: (e,) the index in `begins` of each way's begin.
-    :returns: how many pixels there are, more than p if there was not room for all.
-    """
-    raise NotImplementedError
+#: moves (x, y) to the pixels around and a knight's move away, in the order of their angles
+MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1),
+                  (-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)])
+LENGTHS = np.sqrt((MOVES * MOVES).sum(axis=1))  # px
+_X, _Y = -MOVES[:, 1] / LENGTHS, MOVES[:, 0] / LENGTHS  # unit vectors across
+ACROSS = np.column_stack([_X * _X, 2 * _X * _Y, _Y * _Y])  # weights of the three second derivatives
+OFF = 25.0  # cost of a pixel of way off the ridge, where one on it costs 1
+STRONG = 0.55  # share of the ridge measure at the clicks that costs the least
+BEND = 0.6  # cost of a change of direction by a sixteenth of a turn; that by two is four times as much
+TURNS = np.arange(-2, 3)  # sixteenths of a turn, from one move to the next
+ASIDE = 1.0  # cost of each pixel between a click and the way
+CROSSED = 40.0  # cost by which another arrival at a click may be worse than the best
+MOST = 2_500_000  # states that are settled, about two seconds: along a DLO these are 2 to 50 thousand
+EDGE = 2  # px around the ridge to which no way leads, as wide as the longest move
 
 
 def way(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
@@ -119,83 +48,140 @@ def way(ridge: Ridge, clicks: Floats, reach: float) -> Floats:
     """
     height, width = ridge.hessian.shape[:2]
     places = (np.asarray(clicks) + 0.5) / ridge.factor - 0.5
-    places = np.ascontiguousarray(np.clip(places, 0, (width - 1, height - 1)))
-    pixels = _Search(ridge, max(1.5, reach / ridge.factor)).along(places)
-    found: Floats = np.column_stack([pixels % width, pixels // width]).astype(float)
+    found = _Search(ridge, max(1.5, reach / ridge.factor)).along(np.clip(places, 0, (width - 1, height - 1)))
     return (found + 0.5) * ridge.factor - 0.5
 
 
-def steady(scores: NDArray[np.float32], drift: float) -> tuple[NDArray[np.int64], float]:
+def steady(scores: Singles, drift: float) -> tuple[Indices, Floats]:
     """
-    Return the column of each row with the largest sum of scores, and the mean of that sum over the rows.
+    Return the columns with the largest sum of scores in each matrix, and the means of these sums.
 
-    :param scores: (n, m).
-    :param drift: cost of a change by one column from row to row; that by two is four times as much.
+    :param scores: (k, n, m): k matrices, of which each row gets a column.
+    :param drift: cost of a change by one column from row to row; that by two is four times as much, and more
+        is not possible.
+    :returns: (k, n) and (k,).
     """
-    rows, columns = scores.shape
-    totals, came = np.empty((2, columns)), np.empty((rows, columns), dtype=np.int8)
-    totals[0] = scores[0]
-    add_scores(scores, drift, totals, came)
-    total = totals[(rows - 1) % 2]
-    index = np.empty(rows, dtype=np.int64)
-    index[-1] = np.argmax(total)
-    follow_back(came, index)
-    return index, float(total[index[-1]]) / rows
+    count, rows, columns = scores.shape
+    changes = np.array([0, -1, 1, -2, 2])  # of columns that come to the same, the nearest counts
+    costs = drift * changes ** 2
+    every = np.arange(count)
+    totals = np.full((rows, count, columns + 4), -np.inf)  # largest sum to each column; two more at each side
+    totals[0, :, 2:-2] = scores[:, 0]
+    for row in range(1, rows):
+        best = totals[row - 1, :, 2:-2]
+        for change, cost in zip(changes[1:].tolist(), costs[1:].tolist(), strict=True):
+            best = np.maximum(best, totals[row - 1, :, 2 + change:2 + change + columns] - cost)
+        totals[row, :, 2:-2] = best + scores[:, row]
+    found = np.empty((count, rows), dtype=np.int64)
+    found[:, -1] = totals[-1, :, 2:-2].argmax(axis=1)
+    for row in range(rows - 1, 0, -1):
+        sums = totals[row - 1, every, 2 + found[:, row] + changes[:, None]]
+        found[:, row - 1] = found[:, row] + changes[(sums - costs[:, None]).argmax(axis=0)]
+    return found, totals[-1].max(axis=1) / rows
 
 
 class _Search:
     """
     The search for the way along a ridge.
 
-    :param reach: how far a click may be from it [px of the ridge].
+    A ridge of H x W pixels gets an edge, so that it has P = (H + 4) (W + 4).  A state is d P + the pixel to
+    which the move with the index d leads.
+
+    :param reach: how far a click may be from the way [px of the ridge].
     """
 
     def __init__(self, ridge: Ridge, reach: float) -> None:
-        self._ridge, self._reach = ridge, reach
-        self._height, self._width = ridge.hessian.shape[:2]
-        self._near = 16 * (2 * int(reach) + 3) ** 2  # states around a click, at most
-        states = 16 * self._height * self._width
-        self._before: Bytes = np.zeros(states, dtype=np.int8)
-        # Each state that is looked at leaves the heap, and at most five enter it.  What is not written to
-        # takes no memory.
-        room = self._near + 4 * MOST
-        self._workspace = (np.full(states, np.inf, dtype=np.float32), self._before,
-                           np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float32),
-                           np.empty(states, dtype=np.int64))
+        self._reach = reach
+        self._size = ridge.hessian.shape[1::-1]
+        self._moves = _move_costs(ridge).ravel()  # of the move that leads to each state
+        self._cost = np.full_like(self._moves, np.inf)  # of the best way to each state
+        self._before = np.empty(len(self._moves), dtype=np.int8)  # direction before; -1: the way begins here
+        self._width = self._size[0] + 2 * EDGE
+        self._pixels = len(self._moves) // len(MOVES)
+        self._steps = MOVES @ (1, self._width)
+        turned = (np.arange(len(MOVES))[:, None] + TURNS) % len(MOVES)
+        self._after = turned * self._pixels + self._steps[turned]  # (16, 5) states minus the pixel before
+        self._left = MOST
 
-    def along(self, places: Floats) -> Indices:
-        """Return the pixels (n,), v W + u, of the way along (k, 2) clicks [px of the ridge]."""
-        begins, costs = self._some()
-        count = look_beside(places[0], self._reach, self._height, self._width, begins, costs)
-        begins, costs = begins[:count], costs[:count]
-        left = np.array([MOST])
+    def along(self, places: Floats) -> Floats:
+        """Return the pixels (n, 2) of the way along (k, 2) clicks [px of the ridge]."""
+        states, costs = self._around(places[0])
         parts = []
         for goal in places[1:]:
-            ends, end_costs = self._some()
-            count = find_ways(self._ridge.hessian, self._ridge.floor, goal, self._reach, left, begins, costs,
-                              *self._workspace, ends, end_costs)
-            if not count:
-                return np.empty(0, dtype=np.int64)
-            ends, costs = ends[:count], end_costs[:count]
-            parts.append(self._ways(ends, begins))
-            begins = ends
+            near, aside = self._around(goal)
+            reached = self._settle(states, costs, near, aside)
+            parts.append((reached, self._before[reached]))
+            costs = self._cost[near] + aside
+            self._cost[reached] = np.inf
+            arrived = np.isfinite(costs) & (costs <= costs.min() + CROSSED)
+            if not arrived.any():
+                return np.empty((0, 2))
+            states, costs = near[arrived], costs[arrived]
         # The ways of all parts are kept, and the last click chooses one.
-        found, best = [np.empty(0, dtype=np.int64)], int(np.argmin(costs))
-        for pixels, bounds, links in reversed(parts):
-            found.append(pixels[bounds[best]:bounds[best + 1]])
-            best = links[best]
-        return np.concatenate(found)[::-1]
+        found, state = [], int(states[np.argmin(costs)])
+        for reached, before in reversed(parts):
+            while (direction := int(before[np.searchsorted(reached, state)])) >= 0:
+                last, pixel = divmod(state, self._pixels)
+                found.append(pixel)
+                state = direction * self._pixels + pixel - int(self._steps[last])
+        v, u = np.divmod(found[::-1], self._width)
+        return np.column_stack([u, v]) - float(EDGE)
 
-    def _some(self) -> tuple[Indices, Vector32]:
-        """Return room for the states around a click, and their costs."""
-        return np.empty(self._near, dtype=np.int64), np.empty(self._near, dtype=np.float32)
+    def _around(self, place: Floats) -> tuple[Indices, Singles]:
+        """Return the states around a click, in all directions, and what each costs."""
+        span = np.arange(-int(self._reach) - 1, int(self._reach) + 2)
+        x, y = np.meshgrid(*(np.round(place).astype(int)[:, None] + span))
+        aside = np.hypot(x - place[0], y - place[1])
+        width, height = self._size
+        near = (aside <= self._reach) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        pixels = (y[near] + EDGE) * self._width + x[near] + EDGE
+        states = np.arange(len(MOVES))[:, None] * self._pixels + pixels
+        return states.ravel(), np.tile((aside[near] * ASIDE).astype(np.float32), len(MOVES))
 
-    def _ways(self, ends: Indices, begins: Indices) -> tuple[Indices, Indices, Indices]:
-        """Return the pixels of the ways back, their bounds and their links; see `list_ways`."""
-        bounds, links = np.empty(len(ends) + 1, dtype=np.int64), np.full(len(ends), -1, dtype=np.int64)
-        pixels = np.empty(ROOM, dtype=np.int64)
-        count = list_ways(ends, begins, self._before, self._width, pixels, bounds, links)
-        if count > len(pixels):
-            pixels = np.empty(count, dtype=np.int64)
-            list_ways(ends, begins, self._before, self._width, pixels, bounds, links)
-        return pixels[:count], bounds, links
+    def _settle(self, begins: Indices, costs: Singles, near: Indices, aside: Singles) -> Indices:
+        """
+        Find the ways from one click to the next.
+
+        :param begins: (s,) states at the first click; `costs`: theirs.
+        :param near: (e,) states at the next one; `aside`: what it costs to end there.
+        :returns: all states that were reached, in order.
+        """
+        cost, before = self._cost, self._before
+        cost[begins], before[begins] = costs, -1
+        frontier, reached = begins, [begins]
+        while len(frontier) and self._left > 0:
+            keys = cost[frontier]
+            least = keys.min()
+            if least > (cost[near] + aside).min() + CROSSED:
+                break
+            cheap = keys < least + 1
+            # The cheapest comes last: of ways that cost the same, what is written last stays.
+            bucket = frontier[cheap][np.argsort(keys[cheap])[::-1]]
+            self._left -= len(bucket)
+            direction, pixel = np.divmod(bucket, self._pixels)
+            after = pixel[:, None] + self._after[direction]
+            new = cost[bucket].astype(float)[:, None] + self._moves[after] + BEND * TURNS * TURNS
+            better = new < cost[after]
+            row, turn = np.nonzero(better)
+            after, new = after[row, turn], new[row, turn].astype(np.float32)
+            fresh = np.unique(after[np.isinf(cost[after])])
+            np.minimum.at(cost, after, new)
+            best = new == cost[after]
+            before[after[best]] = direction[row[best]]
+            frontier = np.concatenate([frontier[~cheap], fresh])
+            reached.append(fresh)
+        return np.sort(np.concatenate(reached))
+
+
+def _move_costs(ridge: Ridge) -> Singles:
+    """Return what a move of each direction to each pixel costs (16, H + 4, W + 4); inf: to the edge."""
+    height, width = ridge.hessian.shape[:2]
+    costs = np.full((len(MOVES), height + 2 * EDGE, width + 2 * EDGE), np.inf, dtype=np.float32)
+    floor = ridge.floor * 0.5
+    for d, (x, y) in enumerate(MOVES):
+        across = ridge.hessian @ ACROSS[d]
+        # The ridge counts at the end of the move and half-way.
+        strength = 0.5 * (across + np.roll(across, (y - y // 2, x - x // 2), axis=(0, 1)))
+        off = 1 - np.clip((strength - floor) / (STRONG - floor), 0, 1)
+        costs[d, EDGE:-EDGE, EDGE:-EDGE] = LENGTHS[d] * (1 + (OFF - 1) * off * off)
+    return costs

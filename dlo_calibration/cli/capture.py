@@ -15,7 +15,6 @@ import os
 from pathlib import Path
 import sys
 import threading
-import time
 from typing import Any, Callable, Iterator, TYPE_CHECKING
 import webbrowser
 
@@ -37,8 +36,6 @@ from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
     from dlo_calibration.capture.connections import Graph
-    from dlo_calibration.evaluation.compiling import Compiling
-    from dlo_calibration.simulation.protocol import Simulator
 
 FOLDER = Path('dlo-capture')
 PAPERS = ('a4', 'letter')
@@ -83,43 +80,20 @@ def serve_page(chosen: argparse.Namespace, make_simulator: SimulatorFactory,
     with ExitStack() as stack:
         with _no_output_to_choose('name another folder'):
             make_folder(chosen.folder)
-        simulation = _compiled(stack, should_stop)
-        if should_stop():
-            return
         from dlo_calibration.capture.connections import Connections
         from dlo_calibration.capture.project import Project
         from dlo_calibration.capture.server import serve
-
-        def make_compiled(options: Options) -> Simulator:
-            simulation.wait(should_stop)
-            return make_simulator(options)
 
         project = Project(chosen.folder)
         stack.callback(project.close)
         for problem in project.problems:
             tell(problem)
         connections = Connections(
-            begin=partial(_Calibration.begin, chosen, make_compiled),
-            sentences=_sentences, graph=_graph(), options=_recorded(chosen), make_simulator=make_compiled)
+            begin=partial(_Calibration.begin, chosen, make_simulator),
+            sentences=_sentences, graph=_graph(), options=_recorded(chosen), make_simulator=make_simulator)
         serve(project, connections, host=chosen.host, port=chosen.port, ready=ready,
               should_stop=should_stop)
     tell(f'everything is kept in {chosen.folder}')
-
-
-def _compiled(stack: ExitStack, should_stop: Callable[[], bool]) -> Compiling:
-    """Wait until the tracer is compiled; return the compilation of the simulation, which goes on."""
-    from dlo_calibration.evaluation.compiling import Compiling, load
-    from dlo_calibration.simulation.kernel_cache import TRACER
-
-    tracer, simulation = Compiling(TRACER), Compiling(then=lambda: load(0))
-    for one in (tracer, simulation):
-        stack.callback(one.close)
-        one.begin()
-    while not (tracer.done or should_stop()):
-        for text in tracer.news():
-            tell(text)
-        time.sleep(0.02)
-    return simulation
 
 
 @dataclass

@@ -32,13 +32,12 @@ VERBS = {
     'plot': 'draw a picture of each trial, as measured and as simulated with a result',
     'experiment': "repeat the paper's experiment, which measures how consistent and how valid the found "
                   'parameters are',
-    'warm-up': 'compile everything for this machine, ahead of the first use',
 }
 
 
 def module_of(verb: str) -> Any:
     """Import the module of a verb; it has `add_arguments`, and `act`, which returns the exit code."""
-    return import_module(f'dlo_calibration.cli.{verb.replace("-", "_")}')
+    return import_module(f'dlo_calibration.cli.{verb}')
 
 
 def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | None = None) -> int:
@@ -46,7 +45,7 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | N
     Execute a command line.
 
     :param args: command line without the program's name; None: that of the process.
-    :param make_simulator: makes the engine; None: `told.make_told` does.
+    :param make_simulator: makes the engine; None: as the options say.
     :returns: exit code: 0; 2, with one line on stderr, if an input cannot be used or something cannot
         be written; 130 or 143 if SIGINT (Ctrl-C) or SIGTERM arrived before there was anything to
         report, or before an experiment was complete.
@@ -59,9 +58,9 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | N
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
                              meant(words[0], VERBS, f'see {PROGRAM} --help'))
         chosen = _parser(words).parse_args(words)
-        from dlo_calibration.cli.told import make_told
+        from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 
-        code: int = chosen.act(chosen, make_simulator or make_told)
+        code: int = chosen.act(chosen, make_simulator or make_chosen_simulator)
         return code
     except DloCalibrationError as error:
         tell(f'{PROGRAM}: {" ".join(str(error).split())}')

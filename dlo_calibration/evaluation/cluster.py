@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor, Future
 from functools import partial
+import io
 import logging
 import pickle
 import socket
@@ -14,12 +15,16 @@ import threading
 import time
 import traceback
 from typing import Any, Callable, Mapping
+import uuid
 import warnings
 
 from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.protocol import Simulator, Stop
 
 PATIENCE = 8  # s after which a scheduler counts as unreachable
 RETURN = 30.0  # s that we wait for a worker after the last one was lost
+MOST_KEPT = 1000  # trials and simulators that a worker keeps
 
 
 class ClusterExecutor(Executor):
@@ -49,6 +54,7 @@ class ClusterExecutor(Executor):
         self._pending: dict[Future[Any], Future[Any]] = {}  # future without a result -> Dask's future
         self._given_up: BaseException | None = None
         self._deadline = float('inf')  # [s] by which there must be a worker
+        self._kept: dict[int, tuple[Any, str, bytes]] = {}  # trials and simulators, as workers keep them
         self._silence = _Silence()
         try:
             # Try the address first: Dask's client retries for long, and logs an error when it is deleted.
@@ -70,11 +76,16 @@ class ClusterExecutor(Executor):
         threading.Thread(target=self._watch, name='watching a scheduler', daemon=True).start()
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **keywords: Any) -> Future[Any]:
-        """Return a future that may be cancelled at any time."""
+        """
+        Return a future that may be cancelled at any time.
+
+        Trials and simulators are pickled once, and each worker unpickles them once: with thousands of
+        chains, that takes as long as simulating the trials.
+        """
         future: Future[Any] = Future()
         # Send bytes and a function of Python's library: any worker and the scheduler can unpickle these.  A
         # worker that fails to unpickle a task, e.g. because a module is missing, leaves without an error.
-        self._send(future, pickle.dumps(_Call(call, args, keywords)))
+        self._send(future, _packed(_Call(call, args, keywords), self._kept))
         if self._given_up is not None:
             self._fail(future, self._given_up)
         return future
@@ -195,6 +206,34 @@ class _Call:
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return self._made
+
+
+def _packed(call: _Call, kept: dict[int, tuple[Any, str, bytes]]) -> bytes:
+    """Pickle a call, with trials and simulators as workers keep them, and without what stops it here."""
+    class Pickler(pickle.Pickler):
+        def reducer_override(self, one: Any) -> Any:
+            if isinstance(one, Stop):
+                return Stop, ()
+            if not isinstance(one, (Trial, Simulator)):
+                return NotImplemented
+            if id(one) not in kept:
+                kept[id(one)] = one, uuid.uuid4().hex, pickle.dumps(one, pickle.HIGHEST_PROTOCOL)
+            return _unpacked, kept[id(one)][1:]
+
+    stream = io.BytesIO()
+    Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(call)
+    return stream.getvalue()
+
+
+_here: dict[str, Any] = {}  # what this worker has unpacked
+
+
+def _unpacked(key: str, packed: bytes) -> Any:
+    if key not in _here:
+        while len(_here) >= MOST_KEPT:
+            del _here[next(iter(_here))]
+        _here[key] = pickle.loads(packed)  # noqa: S301  # sent by whoever calibrates
+    return _here[key]
 
 
 def _mistaken(error: BaseException | None) -> bool:

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError
 import copy
 from dataclasses import replace
-from itertools import islice
-from typing import Callable, Iterable, Mapping, Sequence
+from typing import Mapping, Sequence
 
 import numpy as np
 
@@ -20,7 +18,7 @@ from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, TrialScore
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Rollout, simulate_all, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
 
 
 def mean_length(trials: Sequence[Trial]) -> float:
@@ -31,8 +29,6 @@ def mean_length(trials: Sequence[Trial]) -> float:
 class Evaluator:
     """
     Tries parameter sets on trials.
-
-    Worker processes get a pickled one and worker threads a copy; see `Simulator`.
 
     :param every_goal: whether its residuals are those of every goal; if not, they are those of the
         `compared_goals`. Scores and errors are always those of every goal.
@@ -47,17 +43,10 @@ class Evaluator:
         self._length = mean_length(trials)
         self._scores = tuple(TrialScore(trial) for trial in trials)
 
-    def __copy__(self) -> Evaluator:
-        """Return an evaluator with a simulator of its own."""
-        return self._with(simulator=copy.copy(self.simulator))
-
     def of(self, space: ParameterSpace) -> Evaluator:
         """Return an evaluator with other parameters."""
-        return self._with(space=space)
-
-    def _with(self, **changes: object) -> Evaluator:
-        other = Evaluator.__new__(Evaluator)
-        vars(other).update({**vars(self), **changes})  # what belongs to the trials never changes
+        other = copy.copy(self)  # what belongs to the trials never changes
+        other.space = space
         return other
 
     @property
@@ -70,36 +59,18 @@ class Evaluator:
         physical = self.space.physical(values, self._length)
         return [self.simulator.simulate(trial, physical) for trial in self.trials]
 
-    def evaluate(self, index: int, point: Floats,
-                 should_stop: Callable[[], bool] = lambda: False) -> Evaluation:
-        """
-        Try a (d,) point of the unit cube on every trial.
+    def evaluate(self, index: int, point: Floats) -> Evaluation:
+        """Try a (d,) point of the unit cube on every trial, in this thread."""
+        return self.evaluated(index, point, simulate_all(self.simulator, self.jobs(point), Stop()))
 
-        :raises CancelledError: if `should_stop` is True before a trial.
-        """
-        return self.evaluate_all([(index, point)], should_stop)[0]
+    def jobs(self, point: Floats) -> list[Job]:
+        """Return what is simulated at a (d,) point of the unit cube: each trial."""
+        physical = self.space.physical(self.space.values(point), self._length)
+        return [(trial, physical) for trial in self.trials]
 
-    def evaluate_all(self, points: Sequence[tuple[int, Floats]],
-                     should_stop: Callable[[], bool] = lambda: False) -> list[Evaluation]:
-        """
-        Try points of the unit cube, each with its index; to some simulators, several at a time are less work.
-
-        :raises CancelledError: if `should_stop` is True before a trial.
-        """
-        def between() -> None:
-            if should_stop():
-                raise CancelledError
-
-        begun = [Evaluation(index, frozen_array(point), self.space.values(point)) for index, point in points]
-        jobs = [[(trial, physical) for trial in self.trials]
-                for physical in (self.space.physical(one.values, self._length) for one in begun)]
-        if len(begun) == 1:  # a failure ends it
-            return [self._evaluated(begun[0], simulate_all(self.simulator, jobs[0], between))]
-        rollouts = simulate_all(self.simulator, [job for one in jobs for job in one], between)
-        return [self._evaluated(one, list(islice(rollouts, len(self.trials)))) for one in begun]
-
-    def _evaluated(self, evaluation: Evaluation, found: Iterable[Rollout | SimulationError]) -> Evaluation:
-        """Return an evaluation with what its rollouts tell."""
+    def evaluated(self, index: int, point: Floats, found: Sequence[Rollout | SimulationError]) -> Evaluation:
+        """Return the evaluation of a (d,) point with what the rollouts of its `jobs` tell."""
+        evaluation = Evaluation(index, frozen_array(point), self.space.values(point))
         rollouts: list[Rollout] = []
         for rollout in found:
             if isinstance(rollout, SimulationError):

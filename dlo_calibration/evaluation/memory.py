@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import astuple, fields
-from typing import Callable, Mapping, Sequence
+import threading
+from typing import Callable, Sequence
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from dlo_calibration.evaluation.log import digest, Entry, EVALUATION, Evaluation
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, simulate_one, Simulator
+from dlo_calibration.simulation.protocol import Job, Rollout
 
 ERRORS = len(fields(PointErrors))
 
@@ -36,6 +37,7 @@ class Memory:
                  on_failure: Callable[[str], None] = lambda _: None) -> None:
         self._log, self._engine, self._on_failure = log, engine, on_failure
         self._full = False
+        self._writing = threading.Lock()  # threads that simulate write what they find
         self._digests: dict[int, tuple[Trial | Goal, str]] = {}
 
     def of(self, evaluator: Evaluator, finer: bool = False) -> EvaluatorMemory:
@@ -49,9 +51,27 @@ class Memory:
             evaluator.space, evaluator.layout)
         return EvaluatorMemory(self, base, evaluator)
 
-    def simulator(self, simulator: Simulator) -> Simulator:
-        """Return a simulator for this thread that remembers each rollout."""
-        return simulator if self._log is None else _RememberingSimulator(self, self._engine, simulator)
+    def rollout(self, simulator: str, job: Job) -> Rollout | SimulationError | None:
+        """Return the rollout of a job by a simulator of this name, or why it failed; None if it is new."""
+        entry = None if self._log is None else self.find(self._key(simulator, job))
+        if entry is None:
+            return None
+        if not len(entry.numbers):
+            return SimulationError(entry.text)
+        return _rollout(entry.numbers, len(job[0].goals), len(job[0].initial))
+
+    def add_rollouts(self, simulator: str, jobs: Sequence[Job], found: list[Rollout | SimulationError]
+                     ) -> list[Rollout | SimulationError]:
+        """Remember the rollouts of jobs, and return them."""
+        if self._log is not None:
+            for job, one in zip(jobs, found, strict=True):
+                entry = Entry(np.zeros(0), str(one)) if isinstance(one, SimulationError) else Entry(
+                    np.array([one.duration, one.steps, *one.settled, *one.chains.ravel()], float))
+                self.add(self._key(simulator, job), entry)
+        return found
+
+    def _key(self, simulator: str, job: Job) -> str:
+        return f'{ROLLOUT}-{digest(self._engine, simulator, self.digest(job[0]), job[1])}'
 
     def digest(self, trial: Trial) -> str:
         """Return the digest of a trial, which is made once: it may share hundreds of goals with others."""
@@ -73,14 +93,15 @@ class Memory:
 
     def add(self, key: str, entry: Entry) -> None:
         """Write an entry, unless an earlier one could not be written."""
-        if self._log is None or self._full:
-            return
-        try:
-            self._log.add(key, entry)
-        except OSError as error:
-            self._full = True
-            self._on_failure(f'log {self._log.path}: cannot be written: {error}; the calibration goes on, '
-                             'but if it is interrupted, the evaluations from here on are lost')
+        with self._writing:
+            if self._log is None or self._full:
+                return
+            try:
+                self._log.add(key, entry)
+            except OSError as error:
+                self._full = True
+                self._on_failure(f'log {self._log.path}: cannot be written: {error}; the calibration goes '
+                                 'on, but if it is interrupted, the evaluations from here on are lost')
 
 
 class EvaluatorMemory:
@@ -126,48 +147,6 @@ class EvaluatorMemory:
 
     def _key(self, point: Floats) -> str:
         return f'{EVALUATION}-{digest(self._base, np.asarray(point, float))}'
-
-
-class _RememberingSimulator:
-    """A simulator that remembers each rollout; it has no refined one, and stays in its thread."""
-
-    def __init__(self, memory: Memory, engine: str, simulator: Simulator) -> None:
-        self.name = simulator.name
-        self._memory, self._engine, self._simulator = memory, engine, simulator
-
-    def prepare(self) -> None:
-        self._simulator.prepare()
-
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        return simulate_one(self, (trial, physical))
-
-    def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None] = lambda: None
-                          ) -> list[Rollout | SimulationError]:
-        keys = [f'{ROLLOUT}-{digest(self._engine, self.name, self._memory.digest(trial), physical)}'
-                for trial, physical in jobs]
-        found = [self._known(key, trial) for key, (trial, _) in zip(keys, jobs, strict=True)]
-        new = [k for k, one in enumerate(found) if one is None]
-        rollouts = simulate_all(self._simulator, [jobs[k] for k in new], between)
-        for k, one in zip(new, rollouts, strict=True):
-            found[k] = one
-            entry = Entry(np.zeros(0), str(one)) if isinstance(one, SimulationError) else Entry(
-                np.array([one.duration, one.steps, *one.settled, *one.chains.ravel()], float))
-            self._memory.add(keys[k], entry)
-        return [one for one in found if one is not None]
-
-    def _known(self, key: str, trial: Trial) -> Rollout | SimulationError | None:
-        entry = self._memory.find(key)
-        if entry is None:
-            return None
-        if not len(entry.numbers):
-            return SimulationError(entry.text)
-        return _rollout(entry.numbers, len(trial.goals), len(trial.initial))
-
-    def refined(self) -> None:
-        return None
-
-    def close(self) -> None:
-        self._simulator.close()
 
 
 def _flags(trials: Sequence[Trial], names: Sequence[str]) -> list[float]:

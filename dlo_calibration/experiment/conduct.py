@@ -34,7 +34,7 @@ class Plan:
 
     :param runs: calibrations of each subject with each search, each with its own seed.
     :param seed: of the first run.
-    :param workers: processes; 0: one per core.
+    :param workers: threads; 0: one per core.
     :param command: the command that repeats the experiment.
     :param samples: whether the subjects are the samples of the package.
     """
@@ -74,7 +74,7 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     """
     make_folder(folder)
     attempts, journal = Attempts(folder), Journal(folder / JOURNAL, Outcome.of)
-    engines = {subject.name: _prepared_engine(subject, make_simulator) for subject in plan.subjects}
+    engines = {subject.name: _engine(subject, make_simulator) for subject in plan.subjects}
     wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
     perform_all('calibrations', wanted, journal, functools.partial(perform, make_simulator=make_simulator),
                 plan.workers, stop, note, stream)
@@ -98,10 +98,9 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     return account, attempts
 
 
-def _prepared_engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
-    """Prepare the engine for an object, e.g. compile it; return its name."""
+def _engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
+    """Return the name of the engine for an object."""
     with closing(make_simulator(subject.observed.options)) as simulator:
-        simulator.prepare()
         return simulator.name
 
 

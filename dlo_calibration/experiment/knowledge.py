@@ -99,7 +99,7 @@ class Calibration:
 def learn(task: Calibration, make_simulator: SimulatorFactory,
           should_stop: Callable[[], bool] = lambda: False) -> Knowledge:
     """
-    Calibrate once in this process.
+    Calibrate once, on one thread.
 
     :raises SimulationError: if no evaluation could be simulated.
     :raises CancelledError: if stopped.

@@ -50,7 +50,7 @@ class Outcome:
     :param error: mean point error of the same trials [m].
     :param evaluations: number of evaluations of the search.
     :param simulations: number of rollouts in all.
-    :param seconds: its duration in one process [s].
+    :param seconds: its duration on one thread [s].
     :param judgements: one for each trial that judges it.
     :param failure: why it failed; empty if it did not.
     """
@@ -75,7 +75,7 @@ class Outcome:
 def perform(task: Task, make_simulator: SimulatorFactory,
             should_stop: Callable[[], bool] = lambda: False) -> Outcome:
     """
-    Calibrate once in this process, and judge the parameters found.
+    Calibrate once, on one thread, and judge the parameters found.
 
     :raises CancelledError: if stopped.
     """

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.experiment.known_dlos import KnownDlo
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
@@ -115,7 +116,7 @@ def laid(dlo: KnownDlo, points: Floats, simulator: Simulator) -> Floats:
     """Return where a DLO that is laid at (81, 3) points [m] and let go comes to rest."""
     middle = len(points) // 2
     hand = Hand('hand_1', (middle,), np.array([0.0, 0.01]), points[[middle, middle]])
-    found, = rehearse(simulator, [Job(Chain(points), (Step(Action((hand,))),), dlo.physical)])
+    found, = rehearse(Pool(simulator), [Job(Chain(points), (Step(Action((hand,))),), dlo.physical)])
     return np.asarray(found.chains[-1])
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.experiment.known_dlos import KnownDlo
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
@@ -33,7 +34,7 @@ class Reality:
         self.points = start.points  # (N, 3) [m] where the DLO is at rest now
         self._start = start
         self._physical = dlo.physical
-        self._simulator = simulator
+        self._pool = Pool(simulator)
         self._steps: list[Step] = []
 
     @property
@@ -51,7 +52,7 @@ class Reality:
         if hands:
             # All actions are simulated again, as a chain alone does not tell how much the DLO is stretched.
             steps = (*self._steps, Step(Action(hands)))
-            found, = rehearse(self._simulator, [Job(self._start, steps, self._physical)])
+            found, = rehearse(self._pool, [Job(self._start, steps, self._physical)])
             if found.failure:
                 raise SimulationError(found.failure)
             self._steps, self.points = list(steps), found.chains[-1]

@@ -111,7 +111,7 @@ def markdown(account: Account) -> str:
     parts += ['## Validity', 'Average and standard deviation, over the runs, of the difference score of '
               'actions that were not calibrated on, and of their point error.  '
               f'A score below {SIMILAR:g} is similar, and below {VERY_SIMILAR:g} very similar (**bold**).  '
-              'Seconds: one calibration on all trials, in one process.', _validity(account)]
+              'Seconds: one calibration on all trials, on one thread.', _validity(account)]
     if any(one.actions for one in account.findings):
         parts += ['Difference score of each action by itself:', _actions(account)]
     return '\n\n'.join(parts) + '\n'

@@ -91,7 +91,7 @@ class Course:
     :param missed: number of actions in which a hand closed on nothing.
     :param predicted: error that the first plan expected at its end [% of the length].
     :param plans: number of plans; `rollouts` of them all.
-    :param seconds: that all plans took this process.
+    :param seconds: that all plans took, on one thread.
     """
 
     errors: tuple[float, ...]
@@ -191,19 +191,19 @@ class _Desk:
 
     def plan(self, start: Floats, actions: int) -> _Timed:
         """Return a plan from (n, 3) [m] points, with at most so many actions, and the time it took [s]."""
-        begun = time.process_time()
+        begun = time.monotonic()
         found = self._planner(self._task.knowledge, Chain(start), self._goal,
                               replace(self._task.options, actions=actions), simulation=self._simulation,
                               should_stop=self._should_stop)
         if self._should_stop():
             raise CancelledError
-        return found, time.process_time() - begun
+        return found, time.monotonic() - begun
 
 
 def execute(task: PlanTask, make_simulator: SimulatorFactory, planner: Planner,
             should_stop: Callable[[], bool] = lambda: False) -> PlanOutcome:
     """
-    Plan and execute in this process, in the open loop and replanned; both begin with the same plan.
+    Plan and execute in the open loop and replanned; both begin with the same plan.
 
     :raises CancelledError: if stopped.
     """

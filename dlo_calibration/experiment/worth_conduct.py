@@ -35,7 +35,7 @@ class WorthStudy:
 
     :param observed: trials of each object, on which it is calibrated.
     :param pairs: number of starts and goals of each object, from the random `seed`.
-    :param workers: processes; 0: one per core.
+    :param workers: threads; 0: one per core.
     :param command: that repeats the experiment.
     """
 
@@ -65,7 +65,6 @@ def conduct_worth(study: WorthStudy, folder: Path, make_simulator: SimulatorFact
     make_folder(folder)
     attempts = Attempts(folder)
     with closing(make_simulator(Options())) as simulator:
-        simulator.prepare()
         engine = simulator.name
     tasks = _tasks(study, folder, make_simulator, engine, attempts, stop, note, stream)
     journal = Journal(folder / PLANS, PlanOutcome.of)

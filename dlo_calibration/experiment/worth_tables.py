@@ -50,7 +50,7 @@ class Row:
     :param near: share of the errors that are at most NEAR, 0 to 1.
     :param similar: share of the difference scores below VERY_SIMILAR, 0 to 1.
     :param actions: mean number of actions.
-    :param seconds: mean time of the plans of a course, in one process [s].
+    :param seconds: mean time of the plans of a course, on one thread [s].
     :param ratio: median error divided by that with true parameters; None where these are missing.
     :param missed: number of actions in which a hand closed on nothing.
     """
@@ -110,7 +110,7 @@ def markdown(done: Done, command: str, engine: str, complete: bool) -> str:
         f'{options.actions} actions of one hand, tolerance {options.tolerance:g} % of the length. They are '
         'executed in a finer simulation (81 nodes, 1.5 ms) with the true properties. Errors are the mean '
         'distance of 21 points from the goal at the end, in % of the length. Seconds are those of all plans '
-        'of a course, in one process.']
+        'of a course, on one thread.']
     if not complete:
         parts.append('**Not complete**: the tables show what is done; the same command continues.')
     for way, words in ((OPEN_LOOP, 'Open loop: the plan is executed blindly'),

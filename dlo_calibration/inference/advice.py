@@ -13,9 +13,8 @@ Design: A Review, 1995, section 2).
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from typing import Callable, Iterator, Sequence
+from typing import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from dlo_calibration.evaluation.linearisation import (
     STEP,
     WIDEST,
 )
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.inference.uncertainty import DEVIATIONS, IDENTIFIABLE_WIDTH, Uncertainty
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
@@ -36,7 +36,6 @@ from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.observation.excitation import excites
-from dlo_calibration.simulation.protocol import simulate_all, Simulator
 
 MOST_SOUGHT = 6  # parameters for which an action is sought, so that many do not take long
 WORTH_IT = 0.8  # an action is advised if it reduces the standard deviation to less than this share
@@ -74,9 +73,8 @@ class Advice:
     upper: float
 
 
-def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
-           uncertainty: Uncertainty, length: float,
-           should_stop: Callable[[], bool] = lambda: False) -> Advice | None:
+def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats,
+           uncertainty: Uncertainty, length: float) -> Advice | None:
     """
     Return the action that reduces the largest standard deviation most.
 
@@ -96,8 +94,8 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
 
     def simulated(some: Sequence[Candidate], shown: NDArray[np.bool_]
                   ) -> Iterator[tuple[Candidate, Floats | None]]:
-        found = sensitivities([one.trial for one in some], space, simulator, point, uncertainty.std, length,
-                              shown=np.tile(shown, (len(some), 1)), should_stop=should_stop)
+        found = sensitivities([one.trial for one in some], space, pool, point, uncertainty.std, length,
+                              shown=np.tile(shown, (len(some), 1)))
         for candidate, one in zip(some, found, strict=True):
             # None: this DLO does not allow the action.
             yield candidate, None if isinstance(one, SimulationError) else one
@@ -137,9 +135,9 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
     return None
 
 
-def sensitivities(trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator, point: Floats,
-                  std: Floats, length: float, *, shown: NDArray[np.bool_], at_rest: bool = True,
-                  should_stop: Callable[[], bool] = lambda: False) -> list[Floats | SimulationError]:
+def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Floats, std: Floats,
+                  length: float, *, shown: NDArray[np.bool_], at_rest: bool = True
+                  ) -> list[Floats | SimulationError]:
     """
     Return the (m, d) derivative of the simulated chains of each trial [m per unit cube].
 
@@ -154,16 +152,12 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, simulator: Sim
     :return: in place of a derivative, why there is none: a rollout diverges, or does not come to rest.
     :raises CancelledError: when stopped.
     """
-    def check() -> None:
-        if should_stop():
-            raise CancelledError
-
     steps = np.clip(std, STEP, WIDEST)
     beside = [both_sides(point, [k], steps) for k in range(len(point))]
     physical = [[space.physical(space.values(one), length) for one in both] for both in beside]
     jobs = [(trial, one) for trial, row in zip(trials, shown, strict=True)
             for k in np.flatnonzero(row) for one in physical[k]]
-    rollouts = simulate_all(simulator, jobs, check)
+    rollouts = iter(pool.simulate(jobs))
     found: list[Floats | SimulationError] = []
     for trial, row in zip(trials, shown, strict=True):
         matrix, failure = np.zeros((3 * len(trial.goals) * len(trial.initial), len(point))), None

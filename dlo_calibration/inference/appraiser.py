@@ -20,6 +20,7 @@ import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.linearisation import Linearisation, STEP, WIDEST
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.evaluation.robust import Huber
 from dlo_calibration.inference.advice import sensitivities
@@ -38,7 +39,6 @@ from dlo_calibration.model.score import residuals, seen_points
 from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
-from dlo_calibration.simulation.protocol import Simulator
 
 ROUNDS = 8  # Gauss-Newton steps to the best values, at most
 WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
@@ -141,7 +141,7 @@ class Appraiser:
     """
 
     space: ParameterSpace
-    simulator: Simulator
+    pool: Pool
     length: float
     table_height: float | None
     noise: float
@@ -154,6 +154,7 @@ class Appraiser:
         Trials are simulated again where the best values have moved away.
 
         :raises SimulationError: if a trial cannot be simulated.
+        :raises CancelledError: when the pool stops.
         """
         trials = [without_repeated_goals(one) for one in trials]
         models = [*known.models, *[None] * (len(trials) - len(known.models))]
@@ -239,14 +240,17 @@ class Appraiser:
         except SimulationError:
             return None
 
-    def _simulated(self, trial: Trial, point: Floats, simulator: Simulator | None = None) -> Floats:
+    def _simulated(self, trial: Trial, point: Floats, pool: Pool | None = None) -> Floats:
         physical = self.space.physical(self.space.values(point), self.length)
-        return residuals(trial, (simulator or self.simulator).simulate(trial, physical).chains)
+        found, = (pool or self.pool).simulate([(trial, physical)])
+        if isinstance(found, SimulationError):
+            raise found
+        return residuals(trial, found.chains)
 
     def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
         """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
         shown, seen = excites([trial], self.space, self.table_height)[0], self._simulated(trial, point)
-        jacobian, = sensitivities([trial], self.space, self.simulator, point, std, self.length,
+        jacobian, = sensitivities([trial], self.space, self.pool, point, std, self.length,
                                   shown=shown[None], at_rest=False)
         if isinstance(jacobian, SimulationError):
             raise jacobian
@@ -255,7 +259,7 @@ class Appraiser:
 
     def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:
         """Simulate other noise of the initial chain, and finer."""
-        point, moved, finer, fine = model.fit.point, model.moved, None, self.simulator.refined()
+        point, moved, finer, fine = model.fit.point, model.moved, None, self.pool.refined()
         generator = np.random.default_rng(zlib.crc32(trial.initial.points.tobytes()))  # the same each time
         try:
             if self.noise > NO_NOISE and 'length_scale' not in self.space.free:
@@ -267,7 +271,7 @@ class Appraiser:
             pass
         finally:
             if fine is not None:
-                fine.close()
+                fine.simulator.close()
         return replace(model, moved=moved, finer=finer, complete=True)
 
 

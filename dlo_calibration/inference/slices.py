@@ -16,6 +16,7 @@ import numpy as np
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, SCALE
@@ -86,13 +87,14 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
     :param best: the evaluation of the found values.
     :param std: (d,) their standard deviations in the unit cube.
     :param examination: of their surroundings; None if there was none.
-    :param executor: simulates them; None: this thread does.
+    :param executor: simulates them, as in `Pool`.
     :param seconds: time limit [s].
-    :param should_stop: asked between trials; once True, the slices so far are returned.
+    :param should_stop: asked often; once True, the slices so far are returned.
     :param clock: the time [s].
     """
     end = clock() + seconds
-    grid = _Grid(BatchEvaluator(evaluator, lambda: should_stop() or clock() > end, executor), best, std)
+    pool = Pool(evaluator.simulator, executor, lambda: should_stop() or clock() > end)
+    grid = _Grid(BatchEvaluator(evaluator, pool), best, std)
     dimension, varied = evaluator.space.dimension, chosen(evaluator.space.free, std)
     lines: tuple[Line, ...] = ()
     planes: tuple[Plane, ...] = ()

@@ -48,7 +48,7 @@ class PlanOptions(DeclaredOptions):
         (), "boxes that neither a hand nor the DLO may enter, each 'x0 y0 z0 x1 y1 z1', two opposite corners "
         'in metres in the frame of the table; they should be larger than what they protect by the size of '
         'the gripper, as a hand counts as a point', of=MACHINE)
-    workers: int = declared(0, 'number of simulation processes; 0: one per core', minimum=0, maximum=1024,
+    workers: int = declared(0, 'number of threads that simulate; 0: one per core', minimum=0, maximum=1024,
                             of=MACHINE)
 
     def __post_init__(self) -> None:

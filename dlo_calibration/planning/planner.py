@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import dataclass
 import time
 from typing import Callable, Iterator, Mapping
@@ -16,7 +16,7 @@ import numpy as np
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.model.chain import Chain, frozen_array
 from dlo_calibration.observation.table import lying_level
 from dlo_calibration.planning.beam import BeamSearch, Judged
@@ -63,7 +63,7 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     :param options: None: the defaults.
     :param simulation: options of the simulation; None: the defaults.
     :param should_stop: once it is True, the best plan so far is returned.
-    :param executor: simulates; None: as many processes as the options say, for this plan only.
+    :param executor: its workers simulate, e.g. a `ClusterExecutor`; None: as many threads as options say.
     :raises InputError: if start, goal and DLO do not belong together; see `checked`.
     """
     options, simulation, begin = options or PlanOptions(), simulation or Options(), clock()
@@ -81,14 +81,9 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
         left = (clock() - begin) * (expected - rollouts) / rollouts
         on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end), left))
 
-    with ExitStack() as stack:
-        simulator = make_simulator(simulation)
-        stack.callback(simulator.close)
-        own = executor is None and options.workers != 1
-        if own:
-            executor = started = ProcessExecutor(options.workers, answer_limit=simulation.answer_limit)
-            stack.callback(started.close)
-        rehearse, last = Rehearser(simulator, executor, should_stop, own), Rehearser(simulator, executor)
+    with closing(make_simulator(simulation)) as simulator, closing(Threads(options.workers)) as threads:
+        rehearse = Rehearser(Pool(simulator, executor or threads, should_stop))
+        last = Rehearser(Pool(simulator, executor or threads))
         _finish(search, rehearse, last, tell)
         said = () if search.reached else (*remarks(last, posterior, start, goal, options),
                                           *_remarks_on_refusals(search.refusals))

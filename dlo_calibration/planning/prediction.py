@@ -16,6 +16,7 @@ from dlo_calibration.calibration.engines import make_simulator as make_chosen_si
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
 from dlo_calibration.model.manipulation import PATHS, Together
@@ -23,7 +24,6 @@ from dlo_calibration.model.named_actions import NamedAction
 from dlo_calibration.observation.noise import NO_NOISE, noise_of
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
 from dlo_calibration.planning.rehearsal import in_turn, Job, PAUSE, Rehearsal, Rehearser, Step
-from dlo_calibration.simulation.protocol import Simulator
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
 INTERVAL = (5.0, 95.0)  # %
@@ -95,12 +95,13 @@ def simulate(found: CalibratedDlo, chain: Chain,
         raise InputError('simulate', 'no action', 'at least one', 'say what the hands do')
     options = options or Options()
     posterior = Posterior.of(found).lying(chain, options)
-    with closing(make_simulator(options)) as simulator:
-        rehearse = Rehearser(simulator, should_stop=should_stop)
+    with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
+        pool = Pool(simulator, threads, should_stop)
+        rehearse = Rehearser(pool)
         steps, best = _steps(rehearse, chain, actions, posterior.best)
         drawn = rehearse([Job(start, steps, physical) for start, physical in zip(
             _starts(chain, draws, seed), posterior.draws(draws, seed), strict=True)])
-        finer = _finer(simulator, Job(chain, steps, posterior.best), should_stop)
+        finer = _finer(pool, Job(chain, steps, posterior.best))
     failures = [one.failure for one in drawn if one.failure]
     remarks = () if not failures else (
         f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
@@ -143,13 +144,13 @@ def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
             for _ in range(draws)]
 
 
-def _finer(simulator: Simulator, job: Job, should_stop: Callable[[], bool]) -> Floats | None:
+def _finer(pool: Pool, job: Job) -> Floats | None:
     """Return the chains after each action by a finer simulation; None if there is none."""
-    refined = simulator.refined()
+    refined = pool.refined()
     if refined is None:
         return None
-    with closing(refined):
-        found, = Rehearser(refined, should_stop=should_stop)([job])
+    with closing(refined.simulator):
+        found, = Rehearser(refined)([job])
     return None if found.failure else found.chains
 
 

@@ -5,21 +5,18 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
-import math
-from typing import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Mapping, Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.batch import AT_A_TIME
-from dlo_calibration.evaluation.kept import kept_simulator, packed_simulator
+from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.model.action import Action
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.protocol import Rollout, simulate_all, Simulator, TogetherSimulator
+from dlo_calibration.simulation.protocol import Rollout
 
 PAUSE = 1.0  # s from the end of an action to the start of the next; the DLO rests then, however long it takes
 REST = 0.01  # s from the end of an action to the instant from which on the DLO comes to rest
@@ -111,20 +108,18 @@ def _on_the_way(action: Action) -> Floats:
     return np.linspace(action.start, action.end, pieces + 1)[1:-1]
 
 
-def rehearse(simulator: Simulator, jobs: Sequence[Job],
-             between: Callable[[], None] = lambda: None) -> list[Rehearsal]:
+def rehearse(pool: Pool, jobs: Sequence[Job]) -> list[Rehearsal]:
     """
     Simulate sequences of actions; a simulation that diverges gives a rehearsal with a failure.
 
-    :param between: is called again and again; what it raises ends the simulation.
+    :raises CancelledError: when the pool stops.
     """
     trials: list[Trial] = []
     for job, before in zip(jobs, [None, *jobs], strict=False):
         # Draws of the same actions share their trial, as a simulator lays out each trial anew.
         trials.append(trials[-1] if before is not None and job.same_actions(before) else
                       rehearsed_trial(job.start, job.steps, job.courses))
-    rollouts = simulate_all(simulator, [(trial, job.physical) for trial, job in zip(
-        trials, jobs, strict=True)], between)
+    rollouts = pool.simulate([(trial, job.physical) for trial, job in zip(trials, jobs, strict=True)])
     return [_rehearsal(job, trial, rollout) for job, trial, rollout in zip(
         jobs, trials, rollouts, strict=True)]
 
@@ -141,76 +136,18 @@ def _rehearsal(job: Job, trial: Trial, rollout: Rollout | SimulationError) -> Re
 
 
 class Rehearser:
-    """
-    Rehearses many jobs, in this thread or by an executor; the results do not depend on that.
+    """Rehearses jobs, and counts the simulated actions."""
 
-    :param simulator: belongs to this thread; workers use copies of it.
-    :param executor: None: this thread simulates.
-    :param should_stop: asked often.
-    :param takes_part: this thread simulates, too, what the executor has not begun yet: its processes may
-        still be starting.
-    """
-
-    def __init__(self, simulator: Simulator, executor: Executor | None = None,
-                 should_stop: Callable[[], bool] = lambda: False, takes_part: bool = False) -> None:
+    def __init__(self, pool: Pool) -> None:
         self.count = 0  # simulated actions so far
-        self._simulator = simulator
-        self._executor = executor
-        self._should_stop = should_stop
-        self._takes_part = takes_part
-        self._packed = b'' if executor is None else packed_simulator(simulator)
+        self._pool = pool
 
     def __call__(self, jobs: Sequence[Job]) -> list[Rehearsal]:
         """
         Return the rehearsals of jobs, in their order.
 
-        :raises CancelledError: once `should_stop` is True.
+        :raises CancelledError: when the pool stops.
         """
-        found = self._rehearsed_here(jobs) if self._executor is None else \
-            self._rehearsed_by(self._executor, jobs)
+        found = rehearse(self._pool, jobs)
         self.count += sum(len(job.steps) for job in jobs)
         return found
-
-    def _rehearsed_here(self, jobs: Sequence[Job]) -> list[Rehearsal]:
-        return rehearse(self._simulator, jobs, self._check)
-
-    def _rehearsed_by(self, executor: Executor, jobs: Sequence[Job]) -> list[Rehearsal]:
-        size = self._portion(executor, len(jobs))
-        portions = [jobs[first:first + size] for first in range(0, len(jobs), size)]
-        futures = [executor.submit(_rehearse_in_worker, self._packed, portion)
-                   for portion in portions]
-        own: list[list[Rehearsal]] = []  # of the last portions, in reverse order
-        try:
-            while self._takes_part and len(own) < len(portions) and futures[-1 - len(own)].cancel():
-                own.append(self._rehearsed_here(portions[-1 - len(own)]))
-            others = (self._awaited(future) for future in futures[:len(portions) - len(own)])
-            return list(chain.from_iterable([*others, *own[::-1]]))
-        finally:
-            for future in futures:
-                future.cancel()
-
-    def _portion(self, executor: Executor, jobs: int) -> int:
-        """Return how many of so many jobs are simulated at a time."""
-        if not isinstance(self._simulator, TogetherSimulator):
-            return 1
-        return min(AT_A_TIME, math.ceil(jobs / getattr(executor, 'workers', 1)))
-
-    def _check(self) -> None:
-        if self._should_stop():
-            raise CancelledError
-
-    def _awaited(self, future: Future[list[Rehearsal]]) -> list[Rehearsal]:
-        while True:
-            self._check()
-            try:
-                return future.result(timeout=0.05)
-            except TimeoutError:
-                if future.done():
-                    raise
-
-
-def _rehearse_in_worker(packed: bytes, jobs: Sequence[Job]) -> list[Rehearsal]:
-    """Rehearse jobs in a worker, which keeps the simulator of a plan."""
-    return rehearse(kept_simulator(packed), jobs)
-
-

@@ -125,7 +125,7 @@ def page_of(result: CalibrationResult, origin: Origin,
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
         versions={name: _version(name) for name in
-                  ('dlo_calibration', 'numpy', 'scipy', 'numba', 'pybullet')},
+                  ('dlo_calibration', 'numpy', 'scipy', 'pybullet')},
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
         changed=_changed(origin.options), defaults=Options().flat(), options=origin.options.flat(),
         declarations=list(declarations()))

@@ -54,7 +54,7 @@ class PlannerNode(GraphNode[PlannerOptions]):
     """
     The node `planner`; it is the `Graph` of its session.
 
-    :param make_simulator: builds the engine, in the planning thread and in processes.
+    :param make_simulator: builds the engine, in the planning thread.
     :param session: further arguments of `PlannerSession`.
     :param arguments: of `rclpy.node.Node`, e.g. `parameter_overrides`.
     :raises InputError: for a parameter with an unknown name or a bad value, or a description that cannot be

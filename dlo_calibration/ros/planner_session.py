@@ -14,11 +14,10 @@ import json
 import time
 from typing import Any, Callable, Mapping, Protocol, Union
 
-from dlo_calibration.calibration.background import Background, Failure, Notice
+from dlo_calibration.calibration.background import Background, Failure
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
-from dlo_calibration.evaluation.compiling import Compiling
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
@@ -42,7 +41,6 @@ from dlo_calibration.ros.planner_diagnostics import (
 )
 from dlo_calibration.ros.planner_markers import plan_markers
 from dlo_calibration.ros.planner_options import PlannerOptions
-from dlo_calibration.ros.planner_processes import PlannerProcesses
 
 CHAIN, GOAL, DESCRIPTION = 'chain', 'goal_chain', 'dlo_description'
 ACTION, STEPS = 'action', 'steps'
@@ -63,7 +61,7 @@ PROGRESS_PERIOD = 0.1  # s between two messages; nobody reads faster
 FIRST = 'the first actions are simulated'
 PATIENCE = 0.5  # s that closing waits for the planning thread
 
-Event = Union[PlanProgress, Notice, Plan, Failure]
+Event = Union[PlanProgress, Plan, Failure]
 
 
 class PlanFunction(Protocol):
@@ -71,21 +69,8 @@ class PlanFunction(Protocol):
 
     def __call__(self, found: Description, start: Any, goal: Any, options: PlannerOptions, *,
                  simulation: Options, on_progress: Callable[[PlanProgress], None],
-                 should_stop: Callable[[], bool], make_simulator: SimulatorFactory, executor: Any) -> Plan:
+                 should_stop: Callable[[], bool], make_simulator: SimulatorFactory) -> Plan:
         """Return the plan."""
-
-
-class Processes(Protocol):
-    """Keeps processes that simulate, as `PlannerProcesses` does."""
-
-    def prepare(self, simulation: Options, workers: int) -> None:
-        """Begin to start processes; return at once."""
-
-    def ready(self, simulation: Options, workers: int, should_stop: Callable[[], bool]) -> Any:
-        """Return the executor when its processes can simulate."""
-
-    def close(self) -> None:
-        """End the processes now."""
 
 
 class PlannerSession:
@@ -95,24 +80,20 @@ class PlannerSession:
     It is not thread-safe.
 
     :param types: the message classes that `graph` encodes.
-    :param make_simulator: builds the engine, in the planning thread and in processes.
+    :param make_simulator: builds the engine, in the planning thread.
     :param plan: finds the actions.
-    :param processes: simulate for it; None: new ones.
     :param clock: a monotonic clock [s].
     """
 
     status_period = 1.0  # s between two messages about no more than refusals
 
     def __init__(self, graph: Graph[PlannerOptions], types: MessageTypes, make_simulator: SimulatorFactory, *,
-                 plan: PlanFunction = find_plan, processes: Processes | None = None,
+                 plan: PlanFunction = find_plan,
                  clock: Callable[[], float] = time.monotonic) -> None:
         self._graph, self._types, self._clock = graph, types, clock
         self._find = plan
         self._make_simulator = make_simulator
         self._background: Background[Event] = Background('plan')
-        self._compiling = Compiling()
-        self._processes: Processes = processes or PlannerProcesses(
-            make_simulator, lambda text: self._background.events.put(Notice(text)), self._compiling.wait)
         self._chains = {kind: Newest(lambda octets, kind=kind: self._chain(kind, octets))  # type: ignore[misc]
                         for kind in (CHAIN, GOAL)}
         self._descriptions = Newest(self._described)
@@ -128,7 +109,6 @@ class PlannerSession:
         self._plans, self._under_way = 0, False
         self._frame_id = ''  # of the chains that are planned with
         self._back: Pose | None = None  # of the table's frame in that of the chains
-        self._compiling.begin()
         self._report()
 
     @property
@@ -151,12 +131,6 @@ class PlannerSession:
         for problem in found.problems:
             self._graph.warn(f'{origin}: {problem}')
         self._graph.info(f'description from {origin}: a DLO of {found.length:.3g} m')
-        options = self._graph.options()
-        if not self.planning:
-            try:
-                self._processes.prepare(_simulation(found, options), options.workers)
-            except InputError as error:
-                self.refuse(str(error))
         self._report()
 
     def refuse(self, text: str) -> None:
@@ -181,8 +155,6 @@ class PlannerSession:
             self._read_due(kind)
         for event in self._background.waiting_events():
             self._take(event)
-        for text in self._compiling.news():
-            self._graph.info(text)
         if self._progress is not None and self._clock() - self._sent >= PROGRESS_PERIOD:
             self._send_progress()
         self._tell_refusals()
@@ -196,10 +168,8 @@ class PlannerSession:
         self._report()
 
     def close(self) -> None:
-        """End a plan under way, without publishing it, and the processes."""
+        """End a plan under way, without publishing it."""
         self._background.stop()
-        self._compiling.close()
-        self._processes.close()
         self._background.join(PATIENCE)
         for text in self._refusals.rest():
             self._graph.warn(text)
@@ -257,10 +227,9 @@ class PlannerSession:
         checked(found, begin, end, simulation, options)
 
         def work(should_stop: Callable[[], bool]) -> Event:
-            executor = self._processes.ready(simulation, options.workers, should_stop)
             return self._find(found, begin, end, options, simulation=simulation,
                               on_progress=self._background.events.put, should_stop=should_stop,
-                              make_simulator=self._make_simulator, executor=executor)
+                              make_simulator=self._make_simulator)
 
         self._background.join()  # it has put its last event, so it ends now
         self._background.begin(work)
@@ -287,9 +256,6 @@ class PlannerSession:
         if isinstance(event, PlanProgress):
             self._progress = event
             self._detail = '' if self._detail == FIRST else self._detail
-        elif isinstance(event, Notice):
-            self._detail = told(event.text)
-            self._graph.warn(event.text)
         elif isinstance(event, Failure):
             self._under_way = False
             self.fail(event.text, f'no plan: {event.text}', *filter(None, [event.details]))
@@ -330,8 +296,6 @@ class PlannerSession:
         missing, detail = self._missing(), self._detail
         if self._state == WAITING:
             detail = f'for {", ".join(f"~/{name}" for name in missing or ["plan"])}'
-        if self._compiling.under_way and self._state in (WAITING, PLANNING):
-            detail = f'{detail}; {self._compiling.under_way}'
         content: dict[str, Any] = {
             'state': self._state, 'detail': detail, 'missing': missing, 'last_refusal': self._last_refusal,
             'description': self._origin, 'plans': self._plans}

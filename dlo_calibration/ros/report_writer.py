@@ -4,22 +4,25 @@
 """
 ReportWriter: writes the page of a result in the background, because that takes seconds.
 
-Its pictures are drawn in another process: while Matplotlib draws, no other thread of this one advances.
+Its pictures are drawn in another process: while Matplotlib draws in a thread, a service of the node may wait
+for more than 0.1 s.
 """
 
 from __future__ import annotations
 
-from contextlib import closing
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context, parent_process
+import os
 from pathlib import Path
 import queue
+import signal
 import threading
 from typing import Iterator
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.stages import sliced
-from dlo_calibration.evaluation.processes import ProcessExecutor
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.report.page import Origin, page_of, write_page
 from dlo_calibration.writing import reason
@@ -75,7 +78,7 @@ class ReportWriter:
             if older is not None and path.exists():
                 path.replace(older)
             slices = sliced(result, origin.options, self._make_simulator, self._stop.is_set)
-            with closing(ProcessExecutor(1)) as process:
+            with ProcessPoolExecutor(1, get_context('spawn'), _end_with_parent) as process:
                 page = process.submit(page_of, result, origin, partial(_known, slices)).result()
             write_page(path, page)
         except Exception as error:  # the user must learn why there is no page
@@ -85,3 +88,17 @@ class ReportWriter:
 def _known(slices: Slices | None) -> Slices | None:
     """Return slices that were simulated before."""
     return slices
+
+
+def _end_with_parent() -> None:
+    """Leave signals to the node, come after it, and end with it, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(5)
+    threading.Thread(target=_wait_for_its_end, daemon=True).start()
+
+
+def _wait_for_its_end() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -10,7 +10,6 @@ Every error is reported in the log and in ``~/status``, and the node goes on wor
 
 from __future__ import annotations
 
-import gc
 import time
 from typing import Callable, Mapping
 
@@ -22,7 +21,6 @@ from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.worker import Failure, Notice, Worker
 from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
-from dlo_calibration.evaluation.compiling import Compiling, load
 from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, MessageTypes, read
 from dlo_calibration.messages.collector import TrialCollector
@@ -37,7 +35,7 @@ from dlo_calibration.ros.recorder import Recorder
 from dlo_calibration.ros.situation import Calibration, Pace, Situation
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
-PATIENCE = 10.0  # s that closing waits for each worker: a simulation cannot be interrupted
+PATIENCE = 10.0  # s that closing waits for each worker
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
 
 
@@ -61,23 +59,17 @@ class CalibrationSession:
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._outlet = Outlet(graph, types, self._recorder, clock)
-        self._compiling = Compiling(then=self._load)
         self._situation = Situation()
         self._calibration: Calibration | None = None
         self._order = StampOrder()
         self._began = self._clock()
         self.behind = False  # whether messages wait; appraisals and markers would delay them
         self._begin_recording()
-        self._compiling.begin()
         self._report()
 
     @property
     def _collector(self) -> TrialCollector:
         return self.collecting.collector
-
-    def _load(self) -> None:
-        load(self.collecting.options.workers)  # in a thread: delays no answer by over 0.1 s
-        gc.freeze()  # what is loaded stays for ever; each search for garbage in it would take 0.2 s
 
     @property
     def calibrating(self) -> bool:
@@ -147,8 +139,6 @@ class CalibrationSession:
             self._show(at_once=False)
         self._take_events()
         self._recorder.tell()
-        for text in self._compiling.news():
-            self._graph.info(text)
         self._tell_refusals(self._situation.counted.due(self._clock()))
         self._tell_dropped()
         self._start_by_itself()
@@ -182,7 +172,6 @@ class CalibrationSession:
         """End the calibration, with its best evaluation so far as the result, then the recording."""
         self._worker.stop()
         self._appraiser.stop()
-        self._compiling.close()
         try:
             self._tell_dropped(at_once=True)
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
@@ -249,9 +238,7 @@ class CalibrationSession:
         if not trials:
             lacks = self._collector.incomplete or 'an initial_chain, an action and a goal_chain'
             raise InputError('~/start', 'no complete trial', lacks, 'send it, then call ~/start again')
-        compiled = self._compiling.done
-        if compiled:
-            self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
+        self._make_simulator(options).close()  # raises here if the engine or the scene cannot be used
         log = self._recorder.start(trials, options)
         situation = self._situation
         choice = choose(trials, options)
@@ -260,10 +247,9 @@ class CalibrationSession:
         situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
         situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
-        self._worker.start(trials, options, log, self._compiling.wait)
+        self._worker.start(trials, options, log)
         return ' '.join(filter(None, [
-            f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations.', choice.words,
-            '' if compiled else 'It begins when the simulation is compiled, in half a minute or less.']))
+            f'calibrating on {len(trials)} trial(s), {progress.evaluations} evaluations.', choice.words]))
 
     def _start_by_itself(self) -> None:
         situation, wanted = self._situation, self._graph.options().start_after_trials
@@ -362,7 +348,7 @@ class CalibrationSession:
         quiet = now - situation.heard > QUIET
         # While messages keep coming, an appraisal every two seconds leaves the processor to other programs.
         if situation.appraisal.wanted and not self.behind and not self.calibrating and self._collector.count \
-                and self._compiling.done and not self._appraiser.alive \
+                and not self._appraiser.alive \
                 and (quiet or now - situation.appraisal.last > 2.0):
             situation.appraisal = Pace(wanted=not quiet, last=now)
             self._appraiser.start(self._collector.trials, self._graph.options(), situation.result, quiet)
@@ -377,7 +363,7 @@ class CalibrationSession:
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        detail = self.collecting.words or self._situation.detail or self._compiling.under_way
+        detail = self.collecting.words or self._situation.detail
         self._outlet.status(self._situation, self._collector, detail)
 
     def _show(self, at_once: bool = True) -> None:

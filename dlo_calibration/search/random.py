@@ -13,7 +13,7 @@ from dlo_calibration.evaluation.linearisation import Linearisation
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.protocol import Hints, Observation
 
-AT_MOST = 300  # points of one batch: processes wait at its end, and its residuals are in memory until then
+AT_MOST = 300  # points of one batch: threads wait at its end, and its residuals are in memory until then
 
 
 class RandomSearch:

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Simulate a trial: the interface of engines, the nodes of the DLO, the script of a rollout.
+Simulate a trial: the interface of engines, the nodes of the DLO, the script of a trial.
 
-The engines are in `bullet` and `compiled`, the physics of both in `kernels`, which they call by `entries`.
+The engines are in `bullet` and `compiled`, the physics of both in `core`.
 """
 
 from dlo_calibration.simulation.nodes import NodeLayout
-from dlo_calibration.simulation.protocol import Rollout, Simulator
-from dlo_calibration.simulation.rollout import roll_out, Stepper
+from dlo_calibration.simulation.protocol import Rollout, Simulator, Stop
 from dlo_calibration.simulation.script import Script, Settling
 
-__all__ = ['NodeLayout', 'Rollout', 'Script', 'Settling', 'Simulator', 'Stepper', 'roll_out']
+__all__ = ['NodeLayout', 'Rollout', 'Script', 'Settling', 'Simulator', 'Stop']

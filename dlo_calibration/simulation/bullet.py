@@ -4,7 +4,7 @@
 """
 The PyBullet engine: a rope for any PyBullet world, and a simulator of trials that uses it.
 
-The rope's nodes are spheres.  In each step, `kernels` compute their velocities from
+The rope's nodes are spheres.  In each step, the core computes their velocities from
 internal forces, gravity and the rope's contact with itself; Bullet adds contact and
 friction with all other bodies.
 """
@@ -15,18 +15,19 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.parameters import GRAVITY
-from dlo_calibration.simulation import entries
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation import core
 from dlo_calibration.simulation.bullet_world import add_obstacle, Gripper, pybullet
 from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.nodes import feature_shares, NodeLayout, spread_places
 from dlo_calibration.simulation.obstacles import Obstacle, read_scene
-from dlo_calibration.simulation.protocol import advanced, DEFAULT_NODES
-from dlo_calibration.simulation.rope import diverged, Rope
+from dlo_calibration.simulation.protocol import DEFAULT_NODES, Rollout
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion x y z w of no rotation
+NO_TABLE = -1e6  # m; the core's own table is so low that no node touches it
 
 
 class BulletRope:
@@ -73,7 +74,8 @@ class BulletRope:
         self._held: tuple[int, ...] = ()
         self._grippers: list[Gripper] = []
         self._leaving: list[Gripper] = []  # that have opened, and may still be around the rope
-        self.reset(places, points, physical, velocities, features, directions)
+        velocities = np.zeros((len(places), 3)) if velocities is None else velocities
+        self.begin(core.Start(places, points, velocities, features, directions), physical)
 
     @classmethod
     def of(cls, client: int, chain: Chain, physical: Mapping[str, float], *, nodes: int = DEFAULT_NODES,
@@ -83,28 +85,35 @@ class BulletRope:
         rest.setdefault('features', feature_shares(chain, places))
         return cls(client, places, chain.resample(places), physical, **rest)
 
-    def reset(self, places: Floats, points: Floats, physical: Mapping[str, float],
-              velocities: Floats | None = None, features: Floats | None = None,
-              directions: Floats | None = None) -> None:
-        """Start again with other properties, but with the same bodies in the world."""
-        assert len(places) == len(points) == len(self.bodies)
-        velocities = np.zeros((len(places), 3)) if velocities is None else velocities
-        self._rope = Rope(places, points, velocities, physical, self.time_step, self._gravity, features,
-                          directions)
+    def begin(self, start: core.Start, physical: Mapping[str, float]) -> None:
+        """Start again at a start of as many nodes, with other properties, but with the same bodies."""
+        self._rope = core.Rope(start, physical, self.time_step, NO_TABLE, self._gravity)
         self._held = ()
         self.release()
-        state = self._rope.state
-        for body, mass, point in zip(self.bodies, state.rod.masses, state.points.tolist(), strict=True):
+        for body, mass in zip(self.bodies, self._rope.masses.tolist(), strict=True):
             pybullet.changeDynamics(
                 body, -1, mass=mass, lateralFriction=physical['friction'],
                 localInertiaDiagonal=[1e6] * 3,  # kg m^2: so large that spheres slide and do not roll
                 restitution=0.0, linearDamping=0.0, angularDamping=0.0, physicsClientId=self._client)
+        self.move_bodies(self._rope.points)
+
+    def move_bodies(self, points: Floats) -> None:
+        """Move the bodies in the world to (N, 3) [m]."""
+        for body, point in zip(self.bodies, points.tolist(), strict=True):
             pybullet.resetBasePositionAndOrientation(body, point, IDENTITY, physicsClientId=self._client)
+
+    def follow(self, script: core.Script) -> tuple[Floats, tuple[bool, ...], int] | None:
+        """
+        Follow a script of a trial at whose start the rope is; None if the rollout diverges.
+
+        :raises SimulationError: if the rollout diverges.
+        """
+        return self._rope.follow(script, self._take_step)
 
     @property
     def points(self) -> Floats:
         """The nodes' positions now, (N, 3) [m]; a copy."""
-        return self._rope.points
+        return self._rope.points.copy()
 
     def hold(self, nodes: Sequence[int]) -> None:
         """
@@ -139,7 +148,7 @@ class BulletRope:
         :raises InputError: if the rope is further away, or held there already.
         """
         gripper = Gripper(self._client, body, link, place)
-        gripper.close(self._rope.points, self._rope.state.rod.held.tolist(), nodes, reach)
+        gripper.close(self._rope.points, self._rope.held, nodes, reach)
         gripper.touch(self.bodies, False)
         self._grippers.append(gripper)
         self._hold_all()
@@ -152,13 +161,9 @@ class BulletRope:
         self._hold_all()
 
     def _hold_all(self) -> None:
-        self._rope.hold((*self._held, *(node for one in self._grippers for node in one.nodes)))
-        self._targets = self._rope.state.points[self._rope.state.rod.held]
-
-    @property
-    def twists(self) -> bool:
-        """Whether it makes a difference how clamps turn about the axis of the DLO."""
-        return self._rope.twists
+        nodes = [*self._held, *(node for one in self._grippers for node in one.nodes)]
+        self._rope.hold(nodes)
+        self._rope.aim(self._rope.points[nodes])
 
     def step(self, targets: Floats | None = None, turns: Floats | None = None) -> None:
         """Take one step of the whole world; see `before_step`."""
@@ -176,53 +181,60 @@ class BulletRope:
             this step; None: a clamp turns with its segment, and not about it.
         :raises SimulationError: if the rollout diverges.
         """
-        state = self._rope.state
+        aims = self._rope.targets
         if targets is not None:
-            self._targets[:len(self._held)] = targets
-        turned = np.empty((0, 0)) if turns is None else np.ascontiguousarray(turns, dtype=float)
+            aims[:len(self._held)] = targets
+        turned = None if turns is None else np.asarray(turns, dtype=float)
         if self._grippers:
-            turned = self._follow(turned)
-        if not entries.predict_velocities(self._rope.packed, self._targets, turned):
-            raise diverged()
-        sent = state.predicted - self._gravity * self.time_step  # Bullet adds it again
-        client = self._client
-        for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
-            pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
+            turned = self._follow(aims, turned)
+        self._rope.aim(aims, turned)
+        self._send()
 
-    def _follow(self, turns: Floats) -> Floats:
-        """Move the nodes in grippers with them; return `turns` (h, 9) of all held nodes."""
+    def _follow(self, aims: Floats, turns: Floats | None) -> Floats:
+        """Write to `aims` (h, 3) [m] where grippers are; return the `turns` (h, 9) of all held nodes."""
         count = len(self._held)
-        all_turns = [turns if len(turns) else np.tile(np.eye(3).ravel(), (count, 1))]
+        all_turns = [np.tile(np.eye(3).ravel(), (count, 1)) if turns is None else turns]
         for gripper in self._grippers:
             there, turn = gripper.follow()
-            self._targets[count:count + len(there)] = there
+            aims[count:count + len(there)] = there
             all_turns.append(np.tile(turn.ravel(), (len(there), 1)))
             count += len(there)
         return np.concatenate(all_turns)
 
+    def _send(self) -> None:
+        """
+        Give the nodes in Bullet their velocities without contact.
+
+        :raises SimulationError: if they are not finite.
+        """
+        if not self._rope.predict():
+            raise SimulationError('the rollout diverged: the chain is no longer finite')
+        sent = self._rope.predicted - self._gravity * self.time_step  # Bullet adds it again
+        client = self._client
+        for body, velocity in zip(self.bodies, sent.tolist(), strict=True):
+            pybullet.resetBaseVelocity(body, velocity, physicsClientId=client)
+
     def after_step(self) -> None:
         """Read positions and velocities after contact from Bullet."""
-        client, state = self._client, self._rope.state
-        for node, target in zip(state.rod.held, self._targets.tolist(), strict=True):
+        client, rope = self._client, self._rope
+        for node, target in zip(rope.held, rope.targets.tolist(), strict=True):
             pybullet.resetBasePositionAndOrientation(self.bodies[node], target, IDENTITY,
                                                      physicsClientId=client)
         # Without its name, which PyBullet would look up for each node, a fifth faster.
         points = np.array([pybullet.getBasePositionAndOrientation(body, client)[0] for body in self.bodies])
-        state.velocities[:] = (points - state.points) / self.time_step
-        state.support[:] = state.velocities - state.predicted
-        state.points[:] = points
+        rope.velocities[:] = (points - rope.points) / self.time_step
+        rope.support[:] = rope.velocities - rope.predicted
+        rope.points[:] = points
         for gripper in [one for one in self._leaving if one.is_clear_of(points, self._radius)]:
             self._leaving.remove(gripper)
             if not any(one.shares_links_with(gripper) for one in (*self._grippers, *self._leaving)):
                 gripper.touch(self.bodies, True)
 
-    def advance(self, targets: Floats, path: Floats | None = None, turns: Floats | None = None) -> None:
-        """Take k steps; see `rollout.Stepper.advance`."""
-        for k, target in enumerate(targets):
-            self.step(target, None if turns is None else turns[k])
-            advanced()
-            if path is not None:
-                path[k] = self._rope.state.points
+    def _take_step(self) -> None:
+        """Take one step of the whole world to where a script has aimed."""
+        self._send()
+        pybullet.stepSimulation(physicsClientId=self._client)
+        self.after_step()
 
     def remove(self) -> None:
         """Take the rope out of the world."""
@@ -230,7 +242,7 @@ class BulletRope:
             pybullet.removeBody(body, physicsClientId=self._client)
 
 
-class BulletSimulator(Engine[BulletRope]):
+class BulletSimulator(Engine):
     """
     Simulates trials in a PyBullet world of its own: a rope, perhaps a table and a scene.
 
@@ -240,35 +252,32 @@ class BulletSimulator(Engine[BulletRope]):
     time to build the meshes.
 
     :param scene: path of a URDF file with fixed obstacles; empty: none.
+    :param obstacles: of a scene that was read before.
     :param settings: see `Engine`.
     :raises InputError: if the scene cannot be used.
     """
 
     name = 'bullet'
 
-    def __init__(self, *, scene: str = '', **settings: Any) -> None:
+    def __init__(self, *, scene: str = '', obstacles: Sequence[Obstacle] = (), **settings: Any) -> None:
         super().__init__(**settings)
-        self._obstacles = read_scene(scene) if scene else ()
+        self._obstacles = read_scene(scene) if scene else tuple(obstacles)
         self._world: _World | None = None
 
-    def prepare(self) -> None:
-        """Build the scene once, so that one that cannot be built is known before there are copies."""
-        super().prepare()
-        client = pybullet.connect(pybullet.DIRECT)
-        try:
-            for obstacle in self._obstacles:
-                add_obstacle(client, obstacle)
-        finally:
-            pybullet.disconnect(physicsClientId=client)
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """
+        Simulate a trial with physical parameters by name (SI units); one thread at a time may call this.
 
-    def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
-              level: float | None) -> BulletRope:
+        :raises SimulationError: if the rollout diverges.
+        :raises InputError: if the trial grips more points than there are nodes.
+        """
+        known, start, level = self._prepare(trial, physical)
         radius = physical['self_collision'] if self._obstacles else _World.SPHERE
         if self._world is not None and self._world.radius != radius:
             self._end()
         if self._world is None:
-            self._world = _World(layout, physical, self._time_step, radius, self._obstacles)
-        return self._world.start(layout, points, physical, level)
+            self._world = _World(known.layout, physical, self._time_step, radius, self._obstacles)
+        return self._rollout(known, self._world.start(start, physical, level).follow(known.script.events))
 
     def close(self) -> None:
         """Drop what is known of the trials, and end the PyBullet client; the next trial starts another."""
@@ -314,18 +323,16 @@ class _World:
         self._rope = BulletRope(self._client, layout.places, layout.points, physical, radius=radius)
         self._among_obstacles = bool(obstacles)
 
-    def start(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
-              touching: float | None) -> BulletRope:
+    def start(self, start: core.Start, physical: Mapping[str, float], touching: float | None) -> BulletRope:
         """Place rope and table; `touching` [m] is the height of nodes that touch the table."""
         height = self.AWAY if touching is None else touching - self.radius
         # Bullet keeps contact points between steps; a step without contact drops those of the last trial.
         self._place_table(self.AWAY)
         if self._among_obstacles:
-            self._rope.reset(layout.places, points + (0, 0, -self.AWAY), physical)
+            self._rope.move_bodies(self._rope.points + (0, 0, -self.AWAY))
         pybullet.stepSimulation(physicsClientId=self._client)
         self._place_table(height)
-        self._rope.reset(layout.places, points, physical, layout.velocities, layout.features,
-                         layout.directions)
+        self._rope.begin(start, physical)
         return self._rope
 
     def _place_table(self, height: float) -> None:

@@ -1,52 +1,50 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Engine: the common part of both simulators; each adds its own rope."""
+"""Engine: the common part of both simulators; each adds how it takes the steps."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any, Generic, Mapping, Self, TypeVar
+import threading
+from typing import Any, Mapping, Self
 
+from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.table import rest_on, resting_level
-from dlo_calibration.simulation.kernel_cache import compile_kernels, SIMULATION
+from dlo_calibration.observation.table import resting_level
+from dlo_calibration.simulation import core
 from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP, Rollout
-from dlo_calibration.simulation.rollout import roll_out, Stepper
 from dlo_calibration.simulation.script import Script, Settling
-from dlo_calibration.simulation.script_writer import write_script
 
 MOST_KNOWN = 1000  # trials that are kept; a plan simulates each of its trials only once
 MOST_POSITIONS = 200_000  # of hands in the scripts that are kept: 100 MB if each hand holds four nodes
 
-AnyRope = TypeVar('AnyRope', bound=Stepper, covariant=True)
-
 
 @dataclass(frozen=True)
-class _Known:
+class Prepared:
     """
     What of a trial does not depend on the parameters.
 
     :param level: height [m] of nodes on the table; None if it is unknown, or if there is no table.
-    :param points: (N, 3) [m] where nodes start.
+    :param start: of the nodes, unless their height on the table is unknown.
     """
 
     trial: Trial
     layout: NodeLayout
     level: float | None
-    points: Floats
+    start: core.Start
     script: Script
 
 
-class Engine(Generic[AnyRope]):
+class Engine:
     """
     Simulates trials on a table or in the air.
 
     The table is placed so that the rope rests on it at the measured height for every
-    evaluated radius: no radius throws the rope up or lets it fall.
+    evaluated radius: no radius throws the rope up or lets it fall.  Threads may share an engine.
 
     :param table: whether there is a table.
     :param table_height: height of the table [m].
@@ -66,44 +64,36 @@ class Engine(Generic[AnyRope]):
         self._nodes = nodes
         self._time_step = time_step
         self._settling = Settling(stable_distance, stable_time, settle_limit)
-        self._kept: dict[int, _Known] = {}  # by the identities of the trials
+        self._begin()
 
-    def prepare(self) -> None:
-        """See to it that the kernels are compiled."""
-        compile_kernels(SIMULATION)
+    def _begin(self) -> None:
+        self._prepared: dict[int, Prepared] = {}  # by the identities of the trials
+        self._lock = threading.Lock()  # guards them
 
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+    def _prepare(self, trial: Trial,
+                 physical: Mapping[str, float]) -> tuple[Prepared, core.Start, float | None]:
         """
-        Simulate a trial with physical parameters by name (SI units).
+        Return what is known of a trial, where its nodes start, and their height [m] on the table, or None.
 
-        :raises SimulationError: if the rollout diverges.
+        :raises SimulationError: if a hand moves for too long.
         :raises InputError: if the trial grips more points than there are nodes.
         """
-        return roll_out(*self._start(trial, physical))
+        with self._lock:
+            known = self._prepared.get(id(trial))
+            if known is None or known.trial is not trial:
+                level = None if self._table_height is None else resting_level(trial, self._table_height)
+                layout = NodeLayout.of(trial, self._nodes)
+                script = Script.of(trial, layout, self._time_step, self._settling)
+                known = Prepared(trial, layout, level, layout.start(level), script)
+                self._keep(known)
+        if self._table_height is None or known.level is not None:
+            return known, known.start, known.level
+        level = self._table_height + physical['self_collision']
+        return known, known.layout.start(level), level
 
-    def _start(self, trial: Trial, physical: Mapping[str, float]) -> tuple[Script, AnyRope]:
-        """Return the script of a trial, and a rope at the start of it."""
-        known = self._known(trial)
-        level, points = known.level, known.points
-        if self._table_height is not None and level is None:
-            level = self._table_height + physical['self_collision']
-            points = rest_on(points, level)
-        return known.script, self._rope(known.layout, points, physical, level)
-
-    def _known(self, trial: Trial) -> _Known:
-        known = self._kept.get(id(trial))
-        if known is None or known.trial is not trial:
-            level = None if self._table_height is None else resting_level(trial, self._table_height)
-            layout = NodeLayout.of(trial, self._nodes)
-            points = layout.points if level is None else rest_on(layout.points, level)
-            script = write_script(trial, layout, self._time_step, self._settling)
-            known = _Known(trial, layout, level, points, script)
-            self._keep(known)
-        return known
-
-    def _keep(self, known: _Known) -> None:
+    def _keep(self, known: Prepared) -> None:
         """Keep what is known of a trial, and drop what has been known longest if that is too much."""
-        kept, positions = self._kept, known.script.positions
+        kept, positions = self._prepared, known.script.positions
         kept.pop(id(known.trial), None)
         if positions > MOST_POSITIONS:
             return
@@ -112,15 +102,16 @@ class Engine(Generic[AnyRope]):
             del kept[next(iter(kept))]
         kept[id(known.trial)] = known
 
-    def _rope(self, layout: NodeLayout, points: Floats, physical: Mapping[str, float],
-              level: float | None) -> AnyRope:
+    def _rollout(self, known: Prepared, outcome: tuple[Floats, tuple[bool, ...], int] | None) -> Rollout:
         """
-        Return a rope at the start of a trial.
+        Return a rollout for an outcome of the core.
 
-        :param points: (N, 3) [m] positions of its nodes.
-        :param level: height [m] of nodes that touch the table; None: no table.
+        :raises SimulationError: if it diverged.
         """
-        raise NotImplementedError
+        if outcome is None:
+            raise SimulationError('the rollout diverged: the chain is no longer finite')
+        nodes, settled, steps = outcome
+        return Rollout(known.layout.observe @ nodes, settled, steps * self._time_step, steps)
 
     def refined(self) -> Self:
         """Return an engine with twice the segments and half the time step."""
@@ -130,8 +121,12 @@ class Engine(Generic[AnyRope]):
 
     def close(self) -> None:
         """Drop what is known of the trials."""
-        self._kept.clear()
+        self._prepared.clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what belongs to this process."""
-        return {**self.__dict__, '_kept': {}}
+        """Leave out what belongs to this process, and to this engine alone."""
+        return {name: value for name, value in self.__dict__.items() if name not in ('_prepared', '_lock')}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._begin()

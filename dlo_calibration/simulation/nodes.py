@@ -18,6 +18,8 @@ from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place,
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.clamps import clamp_directions
 from dlo_calibration.observation.noise import NO_NOISE, noise, noise_of, smooth
+from dlo_calibration.observation.table import rest_on
+from dlo_calibration.simulation import core
 
 MERGED = 0.15  # of the mean distance of nodes
 
@@ -45,6 +47,11 @@ class NodeLayout:
     point_places: Floats
     features: Floats
     directions: Floats
+
+    def start(self, level: float | None) -> core.Start:
+        """Return the start of nodes; those at rest are at a level [m], or where they are if it is None."""
+        points = self.points if level is None else rest_on(self.points, level)
+        return core.Start(self.places, points, self.velocities, self.features, self.directions)
 
     def nodes(self, hand: Hand) -> tuple[int, ...]:
         """Return the nodes that a hand grips."""

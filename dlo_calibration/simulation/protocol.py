@@ -5,30 +5,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from typing import Callable, Iterator, Mapping, Protocol, runtime_checkable, Sequence
+from typing import Mapping, Protocol, runtime_checkable, Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.core import Stop as Stop  # so that others can use it
 
 # Defaults of both engines and of the options; doc/physics.md shows how little a finer model changes.
 DEFAULT_NODES = 41
 DEFAULT_TIME_STEP = 0.003  # s
-
-_advances = [0]
-
-
-def advanced() -> None:
-    """Count one more piece of a simulation in this process; called at least every few seconds."""
-    _advances[0] += 1
-
-
-def advances() -> int:
-    """Return how many pieces were counted in this process; what hangs does not count any more."""
-    return _advances[0]
 
 
 @dataclass(frozen=True)
@@ -59,22 +49,15 @@ class Rollout:
 Job = tuple[Trial, Mapping[str, float]]  # a trial, and physical parameters by name (SI units)
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """
     Simulates trials; the same call gives the same rollout, bit for bit.
 
-    Worker processes get a pickled simulator and worker threads a copy.  So the first
-    `simulate` creates what belongs to one process or thread, and `__getstate__` drops it.
+    Any number of threads may call it at the same time.  Other machines get a pickled one.
     """
 
     name: str
-
-    def prepare(self) -> None:
-        """
-        Do once what each copy would do again otherwise, e.g. compile into a cache.
-
-        It is called before the first copy is made.
-        """
 
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """
@@ -93,14 +76,19 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class TogetherSimulator(Protocol):
-    """A simulator to which several rollouts at a time are less work."""
+    """
+    A simulator that takes several jobs in one call, which can be stopped in the middle of a rollout.
 
-    def simulate_together(self, jobs: Sequence[Job], between: Callable[[], None]
-                          ) -> list[Rollout | SimulationError]:
+    :param at_a_time: largest number of jobs that should share a call.
+    """
+
+    at_a_time: int
+
+    def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
         """
         Simulate each job; the rollouts are those of `Simulator.simulate`.
 
-        :param between: is called again and again; what it raises ends the simulation.
+        :param stop: once it is set, the call ends within milliseconds; what it returns is not used.
         :returns: the rollouts, or why they failed, in order.
         """
 
@@ -111,24 +99,29 @@ def simulate_one(simulator: TogetherSimulator, job: Job) -> Rollout:
 
     :raises SimulationError: if it failed.
     """
-    found, = simulator.simulate_together([job], lambda: None)
+    found, = simulator.simulate_together([job], Stop())
     if isinstance(found, SimulationError):
         raise found
     return found
 
 
-def simulate_all(simulator: Simulator, jobs: Sequence[Job], between: Callable[[], None]
-                 ) -> Iterator[Rollout | SimulationError]:
-    """Yield the rollout of each job, or why it failed; together if the simulator can."""
-    if isinstance(simulator, TogetherSimulator) and len(jobs) > 1:
-        yield from simulator.simulate_together(jobs, between)
-        return
-    for trial, physical in jobs:
-        between()
-        try:
-            rollout = simulator.simulate(trial, physical)
-        except SimulationError as error:
-            yield error
-        else:
-            advanced()
-            yield rollout
+def simulate_all(simulator: Simulator, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
+    """
+    Return the rollout of each job, or why it failed; together if the simulator can.
+
+    :raises CancelledError: once `stop` is set.
+    """
+    if isinstance(simulator, TogetherSimulator) and not stop.is_set():
+        found = simulator.simulate_together(jobs, stop)
+    else:
+        found = []
+        for trial, physical in jobs:
+            if stop.is_set():
+                break
+            try:
+                found.append(simulator.simulate(trial, physical))
+            except SimulationError as error:
+                found.append(error)
+    if stop.is_set():
+        raise CancelledError
+    return found

@@ -2,20 +2,33 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Script: what happens in a simulated trial, event by event.
+Script: what happens in a simulated trial, step by step, before it is simulated.
 
-It is the same for every engine and parameter set: `script_writer` writes it once, `rollout` follows it.
+Hands close, move and open.  Timed goals are compared at their time; for a goal that
+is a stable configuration, the simulation continues until the DLO has come to rest.
+Time in which the DLO stays at rest is skipped.  Every engine follows the same script,
+with every parameter set.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
-from functools import cached_property
+import math
+from typing import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dlo_calibration.model.chain import Floats
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.action import Hand
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation import core
+from dlo_calibration.simulation.nodes import NodeLayout
+
+MOST_STEPS = 2_000_000  # of one path, which is in memory: 200 MB; 100 minutes at the usual time step
+MOST_TRACED = 5000  # steps that are traced at once: all of them are in memory
+ROUNDING = 1e-9  # s; instants that differ by less are the same
 
 
 @dataclass(frozen=True)
@@ -34,146 +47,240 @@ class Settling:
 
 
 @dataclass(frozen=True)
-class Close:
-    """
-    A hand closes: its nodes keep their offsets from it from now on.
-
-    :param rows: of the table of these offsets, one for each node.
-    :param nodes: that it grips.
-    :param position: (3,) [m] of the hand.
-    """
-
-    rows: slice
-    nodes: list[int]
-    position: Floats
-
-
-@dataclass(frozen=True)
-class Hold:
-    """From now on, exactly these nodes are held."""
-
-    nodes: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Grip:
-    """
-    Nodes that a hand holds while steps are taken; after the last of the k rows, it stays.
-
-    :param rows: (n,) of the table of offsets, one for each node.
-    :param positions: (k, 3) [m] of the hand after each step.
-    :param rotations: (k, 3, 3) of the hand after each step since it closed; None: it does not turn.
-    :param turns: (k, 9) rotation matrices of the hand in each step, row by row.
-    """
-
-    rows: NDArray[np.int64]
-    positions: Floats
-    rotations: Floats | None
-    turns: Floats
-
-
-@dataclass(frozen=True)
-class Advance:
-    """
-    Steps are taken.
-
-    :param grips: what each closed hand does meanwhile.
-    :param count: number of steps; with `settles`, the most.
-    :param settles: they end as soon as the DLO is stable; if it is, and nothing has happened since, none is
-        taken.
-    :param remembers: the points before are kept, see `See`.
-    """
-
-    grips: tuple[Grip, ...]
-    count: int
-    settles: bool = False
-    remembers: bool = False
-
-    def targets(self, offsets: Floats) -> Floats:
-        """
-        Return the positions of the held nodes after each step, (k, h, 3) [m].
-
-        :param offsets: (p, 3) [m] of nodes from the hands that hold them, when these closed.
-        """
-        if not self.grips:
-            return self._positions
-        targets = self._positions + offsets[self._rows]
-        start = 0
-        for grip in self.grips:
-            end = start + len(grip.rows)
-            if grip.rotations is not None:
-                targets[:, start:end] = grip.positions[:, None, :] + np.einsum(
-                    'kij,nj->kni', grip.rotations, offsets[grip.rows])
-            start = end
-        return targets
-
-    @cached_property
-    def _rows(self) -> NDArray[np.int64]:
-        return np.concatenate([np.zeros(0, np.int64), *(grip.rows for grip in self.grips)])
-
-    @cached_property
-    def _positions(self) -> Floats:
-        """The (k, h, 3) [m] positions of the hands that hold the nodes; of at least one step."""
-        rows = max((len(grip.positions) for grip in self.grips), default=1)
-        return np.concatenate([np.zeros((rows, 0, 3)), *(
-            np.repeat(grip.positions[:, None], len(grip.rows), axis=1) for grip in self.grips)], axis=1)
-
-    @cached_property
-    def turns(self) -> Floats:
-        """The (k, h, 9) rotation matrices of the hands that hold the nodes in each step."""
-        return np.concatenate([np.zeros((len(self._positions), 0, 9)), *(
-            np.repeat(grip.turns[:, None], len(grip.rows), axis=1) for grip in self.grips)], axis=1)
-
-
-@dataclass(frozen=True)
-class See:
-    """
-    The DLO is seen at the next goal.
-
-    :param share: it is seen so far (0 to 1) on the way from the points that were remembered to those now;
-        None: now, and the goal is a stable configuration.
-    """
-
-    share: float | None
-
-
-@dataclass(frozen=True)
-class Trace:
-    """
-    Steps are taken, and the DLO is seen at the next goals, all of which have a time.
-
-    The positions in question are the remembered ones, those before the steps, and those after each step.
-    Those before the last step are remembered.
-
-    :param steps: that are taken.
-    :param after: (g,) index of the positions after each goal, at least 1.
-    :param shares: (g,) the DLO is seen so far (0 to 1) on the way to them from those before.
-    """
-
-    steps: Advance
-    after: NDArray[np.int64]
-    shares: Floats
-
-
-Event = Close | Hold | Advance | See | Trace
-
-
-@dataclass(frozen=True)
 class Script:
     """
     What happens in a simulated trial.
 
-    :param events: in order.
-    :param offsets: number of rows of the table of offsets of nodes from hands.
-    :param positions: how many positions of hands the events contain; its memory grows with them.
-    :param observe: see `NodeLayout`.
-    :param settling: when the DLO is stable.
-    :param time_step: [s].
+    :param events: as the core takes them.
+    :param positions: how many positions of hands the events contain; their memory grows with them.
     """
 
-    events: tuple[Event, ...]
-    offsets: int
+    events: core.Script
     positions: int
-    observe: Floats
-    settling: Settling
-    time_step: float
+
+    @classmethod
+    def of(cls, trial: Trial, layout: NodeLayout, time_step: float, settling: Settling) -> Script:
+        """
+        Write the script of a trial.
+
+        :raises SimulationError: if a hand moves for more than `MOST_STEPS`.
+        """
+        writer = _Writer(trial, layout, time_step, settling)
+        writer.write()
+        return cls(core.Script(writer.events, settling.distance, max(5, round(settling.time / time_step))),
+                   writer.positions)
+
+
+@dataclass
+class _ClosedHand:
+    hand: Hand
+    nodes: tuple[int, ...]
+    rows: list[int]
+    since: int  # number of steps when it closed
+    positions: Floats  # (k, 3) [m] of the hand after each later step, until it rests
+    rotations: Floats | None  # (k, 9) since it closed, row by row
+    turns: Floats  # (k + 1, 9) in each of these steps, and none
+
+    def grip(self, steps: int, count: int) -> core.Grip:
+        """Return what it does in the `count` steps after `steps` of the trial."""
+        first = steps - self.since
+        return core.Grip(self.rows, _rows(self.positions, first, count),
+                         None if self.rotations is None else _rows(self.rotations, first, count),
+                         _rows(self.turns, first, count))
+
+
+class _Writer:
+    def __init__(self, trial: Trial, layout: NodeLayout, time_step: float, settling: Settling) -> None:
+        self.events: list[core.Event] = []
+        self.positions = 0
+        self._offsets = 0  # of nodes from the hands that hold them, so far
+        self._trial = trial
+        self._layout = layout
+        self._step = time_step
+        self._settling = settling
+        self._time = 0.0  # [s] of the trial
+        self._steps = 0
+        self._last = 0.0  # time [s] of the points that are remembered
+        self._goal = 0  # index of the current goal
+        self._timed = [goal.time for goal in trial.goals if not goal.stable]  # [s], increasing
+        self._closed: dict[str, _ClosedHand] = {}
+        self._waiting = list(trial.hands)
+
+    def write(self) -> None:
+        """Go up to each goal in turn."""
+        seen = 0  # goals that have been
+        for k, goal in enumerate(self._trial.goals):
+            self._goal = k
+            if goal.stable:
+                self._act_until(goal.time)
+                self._open(goal)
+                self._settle(self._settling.limit)  # takes no time of the trial
+                self.events.append(core.Event.see())
+            elif k >= seen:
+                self._see(goal.time)
+                seen = self._trace(k + 1)
+
+    def _goals(self, first: int) -> Iterator[Goal]:
+        """Yield the goals from an index on, without a copy: a stream has thousands."""
+        for k in range(first, len(self._trial.goals)):
+            yield self._trial.goals[k]
+
+    def _hands(self) -> Iterator[Hand]:
+        """Yield the hands that are closed."""
+        for closed in self._closed.values():
+            yield closed.hand
+
+    def _see(self, instant: float) -> None:
+        """See the DLO at an instant, between two steps."""
+        self._act_until(instant - self._step)
+        while self._time < instant - ROUNDING:
+            self._last = self._time
+            self._close()
+            self._advance(1, remembers=True)
+            self._open_arrived()
+        share = (instant - self._last) / (self._time - self._last) if self._time > self._last else 0.0
+        self.events.append(core.Event.see(min(max(share, 0.0), 1.0)))
+
+    def _trace(self, first: int) -> int:
+        """
+        See the DLO at timed goals, from an index on up to the next event of a hand; return the next index.
+
+        The result is the same as for each goal by itself, but one call to the stepper does.
+        """
+        step = self._step
+        self._close()
+        events = [hand.start for hand in self._waiting] + [
+            hand.end for hand in self._hands() if hand.end > self._time + ROUNDING]
+        end = min(events, default=math.inf) - 2 * step
+        arrived = [hand for hand in self._hands() if hand.end <= self._time + ROUNDING]
+        last = first
+        for goal in self._goals(first):
+            if goal.stable or goal.time > end or goal.time - self._time > MOST_TRACED * step \
+                    or arrived and not all(self._trial.holds(hand, goal) for hand in arrived):
+                break
+            last += 1
+        count = math.ceil((self._trial.goals[last - 1].time - ROUNDING - self._time) / step)
+        if last == first or count <= 0:
+            return first
+        times = np.concatenate([[self._last], self._time + step * np.arange(count + 1)])
+        self._last = float(times[-2])
+        instants = np.array([goal.time for goal in self._trial.goals[first:last]])
+        after = np.clip(np.searchsorted(times, instants - ROUNDING), 1, len(times) - 1)
+        widths = times[after] - times[after - 1]
+        shares = np.clip((instants - times[after - 1]) / np.maximum(widths, ROUNDING), 0.0, 1.0)
+        self._advance(count, sights=list(zip((after - 1).tolist(), shares.tolist(), strict=True)))
+        return last
+
+    def _act_until(self, until: float) -> None:
+        """Let hands act until an instant; skip time in which no hand moves and the DLO is at rest."""
+        while self._time < until - ROUNDING:
+            self._close()
+            ends = [hand.end for hand in self._hands() if hand.end > self._time + ROUNDING]
+            starts = [hand.start for hand in self._waiting if hand.start < until]
+            target = min([*ends, *starts, until])
+            if ends or not self._nothing_timed_before(target):
+                self._advance(max(1, math.ceil((target - self._time) / self._step - 1e-6)))
+            else:
+                self._settle(min(target - self._time, self._settling.limit))
+                self._time = target
+            self._open_arrived()
+
+    def _nothing_timed_before(self, instant: float) -> bool:
+        """Tell whether time until an instant may be skipped: no timed goal lies in it."""
+        return bisect_right(self._timed, self._time) >= bisect_right(self._timed, instant + self._step)
+
+    def _close(self) -> None:
+        closing = [hand for hand in self._waiting if hand.start <= self._time + ROUNDING]
+        for hand in closing:
+            self._waiting.remove(hand)
+            nodes = self._layout.nodes(hand)
+            count = max(1, math.ceil((hand.end - self._time) / self._step - ROUNDING))
+            if count > MOST_STEPS:
+                raise SimulationError(f'{self._trial.name}: hand {hand.name!r} moves for {count} time steps, '
+                                      f'more than {MOST_STEPS}; divide its path into several actions')
+            positions, rotations, turns = _hand_steps(hand, self._time, self._step, count)
+            rows = list(range(self._offsets, self._offsets + len(nodes)))
+            self._offsets += len(nodes)
+            self.events.append(core.Event.close(rows[0], nodes, positions[0]))
+            self._closed.pop(hand.name, None)
+            self._let_go(nodes)
+            self._closed[hand.name] = _ClosedHand(
+                hand, nodes, rows, self._steps, positions[1:],
+                None if rotations is None else rotations[1:], turns)
+        if closing:
+            self._hold()
+
+    def _open_arrived(self) -> None:
+        """Open the hands that have arrived, unless the next goal shows them closed."""
+        for closed in list(self._closed.values()):
+            if closed.hand.end <= self._time + ROUNDING:
+                end = closed.hand.end
+                following = next((goal for goal in self._goals(self._goal) if goal.time > end), None)
+                if following is not None and not self._trial.holds(closed.hand, following):
+                    self._release(closed)
+
+    def _open(self, goal: Goal) -> None:
+        """Open the hands that have arrived and that a goal shows open."""
+        for closed in list(self._closed.values()):
+            if closed.hand.end < goal.time and not self._trial.holds(closed.hand, goal):
+                self._release(closed)
+
+    def _let_go(self, nodes: tuple[int, ...]) -> None:
+        """Take nodes from the hands that hold them, because another hand grips them."""
+        for name, closed in list(self._closed.items()):
+            kept = [k for k, node in enumerate(closed.nodes) if node not in nodes]
+            if not kept:
+                del self._closed[name]
+            elif len(kept) < len(closed.nodes):
+                closed.nodes = tuple(closed.nodes[k] for k in kept)
+                closed.rows = [closed.rows[k] for k in kept]
+
+    def _release(self, closed: _ClosedHand) -> None:
+        del self._closed[closed.hand.name]
+        self._hold()
+
+    def _hold(self) -> None:
+        self.events.append(core.Event.hold(
+            [node for closed in self._closed.values() for node in closed.nodes]))
+
+    def _settle(self, limit: float) -> None:
+        """Let the DLO come to rest, at most for a limit [s], while no hand moves."""
+        time, count = self._time, round(limit / self._step)
+        if count:
+            self._advance(count, settles=True)
+            self._time = time
+
+    def _advance(self, count: int, settles: bool = False, remembers: bool = False,
+                 sights: Sequence[tuple[int, float]] = ()) -> None:
+        """Take steps."""
+        hands = self._closed.values()
+        moving = max((len(closed.turns) - (self._steps - closed.since) for closed in hands), default=1)
+        moving = min(max(moving, 1), count)
+        grips = [closed.grip(self._steps, moving) for closed in hands]
+        self.events.append(core.Event.advance(grips, count, settles, remembers, sights))
+        self._time += count * self._step
+        self._steps += count
+        self.positions += moving * len(hands)
+
+
+def _rows(array: Floats, first: int, count: int) -> Floats:
+    """Return so many rows of an array; where there are no more, the last one again."""
+    found = array[first:first + count]
+    rest = count - len(found)
+    return np.concatenate([found, np.repeat(array[-1:], rest, axis=0)]) if rest else found
+
+
+def _hand_steps(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats | None, Floats]:
+    """
+    Return positions and rotations of a hand.
+
+    :param start: time [s] in the trial.
+    :param step: [s].
+    :returns: (count + 1, 3) [m] positions after 0 to `count` steps; (count + 1, 9) rotations until then, row
+        by row, or None if it does not turn; (count + 1, 9) rotations in each step, and at last none.
+    """
+    positions, turns = hand.poses(start + step * np.arange(count + 1))
+    each = np.concatenate([turns[1:] @ turns[:-1].transpose(0, 2, 1), np.eye(3)[None]]).reshape(-1, 9)
+    turned = frozen_array(turns @ turns[0].T)
+    return frozen_array(positions), (
+        None if np.all(turned == np.eye(3)) else turned.reshape(-1, 9)), frozen_array(each)

@@ -3,9 +3,9 @@
 
 """The choice of an engine: what each name gives, what it refuses, and what is told."""
 
-import copy
 import logging
 import pickle
+import sys
 
 import pytest
 from toy_messages import toy_trials
@@ -15,8 +15,8 @@ from dlo_calibration.calibration import engines
 from dlo_calibration.calibration.engines import ENGINES, make_simulator
 from dlo_calibration.calibration.options import declarations, Options
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation import ProcessSimulator
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation.bullet import BulletSimulator
 
 BOX = ('<robot name="box"><link name="box"><collision><geometry><box size="0.1 0.1 0.1"/></geometry>'
        '</collision></link></robot>')
@@ -51,7 +51,7 @@ def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
 
 def test_bullet_is_one_option_away(notices):
     simulator = make_simulator(Options(engine='bullet'))
-    assert type(copy.copy(simulator)) is BulletSimulator
+    assert type(simulator) is ProcessSimulator
     assert simulator.name == 'bullet'
     assert notices() == []
 
@@ -77,7 +77,7 @@ def test_the_compiled_engine_refuses_a_scene_by_name(scene):
 def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
-    assert notices() == [f'PyBullet simulates the evaluations, about 50 times slower, because engine '
+    assert notices() == [f'PyBullet simulates the evaluations, about 60 times slower, because engine '
                          f'compiled does not support a scene: {scene}']
 
 
@@ -91,3 +91,25 @@ def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engin
 def test_a_path_is_relative_to_the_working_directory(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert make_simulator(Options(engine='bullet', scene='box.urdf')).name == 'bullet'
+
+
+@pytest.fixture
+def without_pybullet(monkeypatch):
+    """Let PyBullet be one of the libraries that are not installed."""
+    monkeypatch.setitem(sys.modules, 'pybullet', None)
+
+
+def test_without_pybullet_its_engine_and_scenes_are_refused_in_a_sentence(without_pybullet, scene):
+    for options, thing in ((Options(engine='bullet'), 'engine bullet'),
+                           (Options(scene=scene), f'scene {scene}')):
+        with pytest.raises(InputError) as refusal:
+            calibrate(toy_trials(1), options)
+        assert str(refusal.value) == (f'{thing}: got PyBullet is not installed, expected that library; '
+                                      'install it: pip install pybullet')
+
+
+def test_without_pybullet_a_result_is_not_confirmed_and_says_so(without_pybullet):
+    result = calibrate(toy_trials(1), Options(evaluations=4, search='random', workers=2))
+    assert result.confirmation is None
+    assert result.warnings[-1] == ('PyBullet is not installed, so no second engine confirmed the result; '
+                                   'pip install pybullet')

@@ -4,13 +4,12 @@
 """Trials are appraised beside whoever asks: in order, once each, and they end when told to."""
 
 from dataclasses import replace
-import os
+import threading
 import time
 
-from processes import simulating
 import pytest
 from toy_messages import toy_trials, TRUTH
-from toy_simulator import new_toy, ToySimulator
+from toy_simulator import new_toy, Stoppable, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.live_information import LiveInformation
@@ -107,16 +106,16 @@ def test_an_engine_that_cannot_be_had_gives_a_sentence():
     assert told.words == 'the information of trial 2 is unknown: no such engine'
 
 
-def test_a_stop_in_the_middle_ends_its_process_and_says_nothing():
-    appraiser = LiveInformation(lambda _: ToySimulator(seconds=1000.0))
+def test_a_stop_in_the_middle_of_a_rollout_ends_it_and_says_nothing():
+    engine, before = Stoppable(), set(threading.enumerate())
+    appraiser = LiveInformation(lambda _: engine)
     appraiser.start(TRIALS, OPTIONS)
-    begun = time.monotonic()
-    while not simulating(os.getpid()):
-        assert time.monotonic() - begun < PATIENCE
-        time.sleep(0.01)
+    assert engine.begun.wait(PATIENCE)
     with pytest.raises(DloCalibrationError, match='under way'):
         appraiser.start(TRIALS, OPTIONS)
+    begun = time.monotonic()
     appraiser.stop()
     assert appraiser.join(PATIENCE)
-    assert not simulating(os.getpid())
+    assert time.monotonic() - begun < 0.2
     assert list(appraiser.waiting_information()) == []
+    assert set(threading.enumerate()) <= before

@@ -34,17 +34,16 @@ class Engines:
     """The engines of one calibration: the searching one and the confirming one, which count together."""
 
     def __init__(self, last=None):
-        self.last, self.made = last, []
+        self.last, self.made, self.counted = last, [], []
 
     def __call__(self, options):
-        before = self.count
-        self.made.append(Mortal('toy' if options.engine == 'auto' else 'bullet',
-                                None if self.last is None else self.last - before, die))
+        name = 'toy' if options.engine == 'auto' else 'bullet'
+        self.made.append(Mortal(name, self.last, die, self.counted))
         return self.made[-1]
 
     @property
     def count(self):
-        return sum(one.count for one in self.made)
+        return len(self.counted)
 
 
 def told(result):
@@ -80,7 +79,7 @@ def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
                 result = calibrate(trials, options, make_simulator=engines, log=log)
             break
         except Killed:
-            simulated += engines.count - 1
+            simulated += engines.count
             kills += 1
     assert told(result) == expected
     assert kills >= 4
@@ -111,7 +110,7 @@ def test_what_comes_after_the_search_is_not_simulated_twice_either(left, unkille
 
 
 @pytest.mark.parametrize('first, then', [(1, 2), (2, 1)])
-def test_it_goes_on_with_another_number_of_processes(first, then, tmp_path):
+def test_it_goes_on_with_another_number_of_threads(first, then, tmp_path):
     trials, seen = toy_trials(3), []
 
     def stop_late(evaluation):

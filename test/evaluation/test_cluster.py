@@ -263,6 +263,7 @@ def test_a_result_that_dask_takes_for_an_error_is_asked_for_again():
 
     executor = object.__new__(cluster.ClusterExecutor)
     executor._executor, executor._pending, executor._given_up = Scheduler(), {}, None
+    executor._kept = {}
     executor._closed = threading.Event()
     assert executor.submit(pow, 2, 3).result(timeout=5) == 8
     assert executor._executor.asked == 2

@@ -16,6 +16,7 @@ from dlo_calibration import Chain, Goal, SimulationError, Trial
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import advised
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.inference.advice import advise, candidates, MOST_SOUGHT
 from dlo_calibration.model.named_actions import NAMED_ACTIONS
 from dlo_calibration.model.parameters import ParameterSpace
@@ -62,8 +63,8 @@ def found(simulator, *trials):
 
 
 def advice_for(simulator, result, **rest):
-    return advise(result.trials, SPACE, simulator, result.best.point, result.examination.uncertainty,
-                  result.length, **rest)
+    return advise(result.trials, SPACE, Pool(simulator, **rest), result.best.point,
+                  result.examination.uncertainty, result.length)
 
 
 def test_the_only_action_that_tells_about_a_parameter_is_advised():
@@ -131,7 +132,8 @@ def test_of_many_parameters_the_least_certain_are_sought():
     result = remembering_result()
     unsure = replace(result.examination.uncertainty, std=np.where(np.arange(30) < 4, 0.15, 0.2))
     simulator = Telling('')
-    assert advise(result.trials, result.space, simulator, result.best.point, unsure, result.length) is None
+    assert advise(result.trials, result.space, Pool(simulator), result.best.point, unsure,
+                  result.length) is None
     assert len(simulator.names) <= 2 * MOST_SOUGHT * len(list(candidates(result.trials)))
 
 

@@ -11,6 +11,7 @@ import pytest
 from toy_simulator import REACH, toy_trial, ToySimulator
 
 from dlo_calibration import Chain, Goal, Hand, SimulationError
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.inference.appraiser import Appraiser, Knowledge, without_repeated_goals
 from dlo_calibration.inference.uncertainty import UNKNOWN_STD
 from dlo_calibration.model.parameters import ParameterSpace
@@ -49,7 +50,7 @@ def learned(trials, simulator=None, space=SPACE):
     found = [Knowledge.before(space.free, space.default_point())]
     for count in range(1, len(trials) + 1):
         some = trials[:count]
-        appraiser = Appraiser(space, simulator or ToySimulator(), 1.0, 0.0, noise(some))
+        appraiser = Appraiser(space, Pool(simulator or ToySimulator()), 1.0, 0.0, noise(some))
         found.append(appraiser.after(found[-1], some))
     return found
 
@@ -109,7 +110,8 @@ def test_a_value_is_found_from_where_no_derivative_points_to_it():
     start = np.array([0.4, 0.1])
     known = Knowledge.before(SPACE.free, start)
     one = noisy_trial('trial 1', 0)
-    after = Appraiser(SPACE, Fading(), 1.0, 0.0, noise([one]), guessed=('friction',)).after(known, [one])
+    after = Appraiser(SPACE, Pool(Fading()), 1.0, 0.0, noise([one]), guessed=('friction',)).after(
+        known, [one])
     assert after.point == pytest.approx([0.4, 0.7], abs=0.02)
     assert after.uncertainty.verdicts == ('identifiable', 'identifiable')
 
@@ -179,6 +181,6 @@ def test_after_a_result_the_next_trial_adds_to_what_it_found():
     assert result.examination.regular
     known = Knowledge(SPACE.free, result.best.point, result.examination.uncertainty)
     trials = [*result.trials, noisy_trial('trial 5', 9)]
-    after = Appraiser(SPACE, ToySimulator(), 1.0, 0.0, noise(trials)).after(known, trials)
+    after = Appraiser(SPACE, Pool(ToySimulator()), 1.0, 0.0, noise(trials)).after(known, trials)
     assert std(after) / std(known) == pytest.approx([0.9, 0.9], rel=0.4)
     assert len(after.models) == 5

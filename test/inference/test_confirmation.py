@@ -3,16 +3,15 @@
 
 """A second engine that confirms what a first one found."""
 
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 import json
-import threading
 
 from fitting import fitted
 import numpy as np
 import pytest
 from serial import serial
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
-from toy_simulator import ToySimulator
+from toy_simulator import Stoppable, ToySimulator
 
 from dlo_calibration import calibrate, SimulationError
 from dlo_calibration.calibration.options import Options
@@ -78,32 +77,18 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
 
 
-class Elsewhere(SecondToy):
-    """It may simulate in another thread only."""
-
-    home = threading.get_ident()
-
-    def simulate(self, trial, physical):
-        assert threading.get_ident() != self.home
-        return super().simulate(trial, physical)
-
-
-@pytest.mark.parametrize('failure', [None, SimulationError('the rollout diverged')])
-def test_beside_other_stages_other_processes_confirm_to_the_same_figures(failure):
-    before, expected = found(SecondToy(0.004, failure=failure))
-    make = engines(Elsewhere(0.004, failure=failure))
-    with ThreadPoolExecutor(2) as executor:
-        after = confirmed(before, OPTIONS, make, ahead=confirming(before, OPTIONS, make, executor))
+def test_it_is_simulated_while_other_stages_go_on():
+    before, expected = found(SecondToy(0.004))
+    with confirming(before, SecondToy(0.004)) as confirm:
+        after = confirm(replace(before, warnings=('of another stage',)))
     assert after.confirmation == expected.confirmation
-    assert after.warnings == expected.warnings
+    assert after.warnings == ('of another stage', *expected.warnings)
 
 
-def test_nothing_is_begun_where_there_is_nothing_to_confirm():
+def test_nothing_is_simulated_where_there_is_nothing_to_confirm():
     before, _ = found(SecondToy())
-    with ThreadPoolExecutor(1) as executor:
-        assert confirming(before, OPTIONS, engines(SecondToy()), None) is None
-        assert confirming(before, Options(engine='compiled'), engines(SecondToy()), executor) is None
-        assert confirming(before, OPTIONS, engines(ToySimulator()), executor) is None
+    for options, second in ((Options(engine='compiled'), SecondToy()), (OPTIONS, ToySimulator())):
+        assert confirmed(before, options, engines(second)) == before
 
 
 def test_it_costs_no_evaluation():
@@ -195,11 +180,11 @@ def test_a_stopped_search_is_confirmed_too():
 
 
 def test_a_confirmation_that_takes_too_long_after_a_stop_is_given_up(monkeypatch):
-    monkeypatch.setattr('dlo_calibration.calibration.stages.STOPPED_PATIENCE', -1.0)
-    count = []
-    result = calibrate(toy_trials(2), OPTIONS,
-                       make_simulator=engines(SecondToy()), on_evaluation=count.append,
-                       should_stop=lambda: len(count) >= 3)
+    monkeypatch.setattr('dlo_calibration.calibration.stages.STOPPED_PATIENCE', 0.2)
+    seen, second = [], Stoppable()
+    second.name = 'second toy'
+    result = calibrate(toy_trials(2), OPTIONS, make_simulator=engines(second), on_evaluation=seen.append,
+                       should_stop=lambda: len(seen) >= 3)
     assert result.confirmation is None
     assert result.warnings == ('not confirmed by engine bullet: stopped on request',)
 

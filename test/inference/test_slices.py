@@ -89,9 +89,9 @@ def test_pair_that_depends_on_each_other_most_comes_first(result):
 
 def test_what_takes_too_long_is_left_out(result):
     now = iter(np.arange(10000.0))
-    slices = around(result, seconds=60, clock=lambda: next(now))
+    slices = around(result, seconds=40, clock=lambda: next(now))
     assert not slices.complete
-    assert slices.evaluations < 60
+    assert slices.evaluations <= 40
     assert all(len(line.values) <= LEVELS[0] + 2 for line in slices.lines)
     nothing = around(result, should_stop=lambda: True)
     assert (nothing.lines, nothing.planes, nothing.evaluations, nothing.complete) == ((), (), 0, False)

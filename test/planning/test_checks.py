@@ -12,6 +12,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import Chain, InputError, Options
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.planning.checks import checked, remarks, sharpest_bend
 from dlo_calibration.planning.dlo import Posterior
@@ -138,7 +139,7 @@ def told(goal, found=None, start=None, **options):
     found = found or MadeUpDlo()
     start, goal = checked(found, start or straight(), goal, Options(), chosen)
     simulator = make_simulator(Options())
-    rehearse = Rehearser(simulator)
+    rehearse = Rehearser(Pool(simulator))
     try:
         return remarks(rehearse, Posterior.of(found), start, goal, chosen)
     finally:
@@ -184,8 +185,8 @@ def test_the_sharpest_bend_that_friction_holds_is_told():
 
 def test_a_goal_that_cannot_be_simulated_is_told():
     found = MadeUpDlo()
-    sentence, = remarks(Rehearser(ToySimulator(fail_below=101)), Posterior.of(found), straight(), arc(1.5),
-                        PlanOptions(draws=0))
+    rehearse = Rehearser(Pool(ToySimulator(fail_below=101)))
+    sentence, = remarks(rehearse, Posterior.of(found), straight(), arc(1.5), PlanOptions(draws=0))
     assert sentence.startswith('whether the DLO stays on the goal cannot be told: ')
 
 

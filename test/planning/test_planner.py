@@ -3,7 +3,6 @@
 
 """Plans find known moves, keep to their limits, and do not depend on the number of workers."""
 
-from concurrent.futures import Executor, Future
 from dataclasses import replace
 import itertools
 
@@ -13,7 +12,7 @@ import pytest
 from soft_simulator import follow, new_soft, SoftSimulator
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.processes import ProcessExecutor
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.named_actions import GraspAndPlace
 from dlo_calibration.planning.crossings import crossings
@@ -24,9 +23,7 @@ from dlo_calibration.planning.planner import plan
 from dlo_calibration.planning.prediction import simulate
 from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearser, Step
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.simulation.kernel_cache import compile_kernels, TOGETHER
 
-compile_kernels(TOGETHER)
 DLO = MadeUpDlo()
 QUICK = Options(nodes=25, time_step=0.004)
 ONE = PlanOptions(workers=1, draws=2)
@@ -102,7 +99,7 @@ def test_more_actions_than_permitted_are_not_planned():
 class OneByOne(CompiledSimulator):
     """It simulates one trial after the other."""
 
-    simulate_together = None  # type: ignore[assignment]
+    at_a_time = 1
 
 
 def assert_same(one, other):
@@ -115,13 +112,11 @@ def assert_same(one, other):
         np.testing.assert_array_equal(here.action.hands[0].positions, there.action.hands[0].positions)
 
 
-def test_processes_find_the_same_plan_as_this_thread():
-    executor = ProcessExecutor(2)
-    try:
-        together = plan(DLO, straight(), TWO_MOVES, ONE, make_simulator=new_soft, executor=executor)
-    finally:
-        executor.close()
-    assert_same(planned(TWO_MOVES), together)
+def test_any_number_of_threads_finds_the_same_plan():
+    one, two, three = (plan(DLO, straight(), TWO_MOVES, replace(ONE, workers=workers),
+                            make_simulator=new_soft) for workers in (1, 2, 3))
+    assert_same(one, two)
+    assert_same(one, three)
 
 
 def test_sequences_simulated_together_give_the_plan_of_sequences_simulated_one_by_one():
@@ -134,22 +129,6 @@ def test_sequences_simulated_together_give_the_plan_of_sequences_simulated_one_b
     assert len(alone.actions) == 2
     assert_same(alone, found(CompiledSimulator(nodes=15, time_step=0.006), 1))
     assert_same(alone, found(CompiledSimulator(nodes=15, time_step=0.006), 2))
-
-
-class Idle(Executor):
-    """It never begins what it is asked for."""
-
-    def submit(self, call, /, *args, **keywords):
-        """Return a future that stays open until it is cancelled."""
-        return Future()
-
-
-def test_a_thread_need_not_wait_for_processes_that_are_still_starting():
-    job = [Job(straight(), (Step(one.action),), {}) for one in planned(TWO_MOVES).actions]
-    alone, first = Rehearser(SoftSimulator()), Rehearser(SoftSimulator(), Idle(), takes_part=True)
-    for one, other in zip(alone(job), first(job), strict=True):
-        np.testing.assert_array_equal(one.chains, other.chains)
-    assert alone.count == first.count == 2
 
 
 def test_a_stopped_plan_is_the_best_so_far():
@@ -215,7 +194,8 @@ def test_the_dlo_keeps_out_of_a_no_go_box_on_its_way():
     jobs = [Job(straight(), in_turn([Step(one.action) for one in found.actions]), {}, courses=True)
             for found in (free, kept)]
     entered = [any(((np.abs(chain[:, 0]) < 0.05) & (chain[:, 1] > 0.04) & (chain[:, 1] < 0.08)).any()
-                   for course in one.courses for chain in course) for one in Rehearser(SoftSimulator())(jobs)]
+                   for course in one.courses for chain in course)
+               for one in Rehearser(Pool(SoftSimulator()))(jobs)]
     assert entered == [True, False]
 
 
@@ -229,7 +209,7 @@ def test_what_is_surer_is_preferred():
     objective, errors = Objective(straight(), goal, 'points'), []
     for found in plans:
         jobs = [Job(straight(), (Step(found.actions[0].action),), one) for one in others]
-        ends = [one.chains[-1] for one in Rehearser(SoftSimulator(unsure=True))(jobs)]
+        ends = [one.chains[-1] for one in Rehearser(Pool(SoftSimulator(unsure=True)))(jobs)]
         errors.append(np.mean([objective.error(end) for end in ends]))
     assert errors[1] < 0.5 * errors[0]
 

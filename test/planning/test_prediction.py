@@ -12,6 +12,7 @@ from toy_simulator import ToySimulator
 
 from dlo_calibration import calibrate, Chain, InputError, Options, read_session
 from dlo_calibration.calibration.engines import make_simulator
+from dlo_calibration.evaluation import Pool
 from dlo_calibration.files.samples import samples
 from dlo_calibration.files.session import session_trials
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
@@ -117,9 +118,9 @@ def test_rehearsals_do_not_depend_on_the_executor():
     step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     jobs = [Job(straight(), (step, step), physical, courses=True)
             for physical in Posterior.of(MadeUpDlo()).draws(4, 1)]
-    alone = Rehearser(simulator)
+    alone = Rehearser(Pool(simulator))
     with ThreadPoolExecutor(2) as executor:
-        together = Rehearser(simulator, executor)
+        together = Rehearser(Pool(simulator, executor))
         for one, other in zip(alone(jobs), together(jobs), strict=True):
             assert np.array_equal(one.chains, other.chains)
             assert all(map(np.array_equal, one.courses, other.courses))
@@ -130,7 +131,7 @@ def test_rehearsals_do_not_depend_on_the_executor():
 @pytest.mark.parametrize('speed', [0.1, 1.0])
 def test_a_course_misses_nothing_however_fast_the_hand_is(speed):
     step = Step(GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.1, speed=speed).action(straight()))
-    found, = Rehearser(make_simulator(Options()))(
+    found, = Rehearser(Pool(make_simulator(Options())))(
         [Job(straight(), (step,), Posterior.of(MadeUpDlo()).best, courses=True)])
     course, = found.courses
     assert np.linalg.norm(np.diff(course[:, 0], axis=0), axis=1).max() < 0.0101
@@ -142,7 +143,7 @@ def test_a_hand_that_holds_does_so_on_the_way_of_another_one():
     lift = LiftAndHold(point=20, height=0.1, hand='a').action(straight())
     drag = Drag(point=0, to=(0.0, 0.1, 0.004), hand='b').action(straight())
     steps, physical = (Step(lift, ('a',)), Step(drag, ('a',))), Posterior.of(MadeUpDlo()).best
-    without, with_courses = Rehearser(make_simulator(Options()))(
+    without, with_courses = Rehearser(Pool(make_simulator(Options())))(
         [Job(straight(), steps, physical, courses) for courses in (False, True)])
     assert with_courses.courses[1][:, 20, 2].min() > 0.1
     np.testing.assert_allclose(with_courses.chains, without.chains, atol=1e-3)
@@ -150,7 +151,7 @@ def test_a_hand_that_holds_does_so_on_the_way_of_another_one():
 
 def test_draws_of_the_same_actions_are_rehearsed_as_each_alone():
     step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
-    rehearse, start, steps = Rehearser(make_simulator(Options())), straight(), (step,)
+    rehearse, start, steps = Rehearser(Pool(make_simulator(Options()))), straight(), (step,)
     draws = Posterior.of(MadeUpDlo()).draws(3, 1)
     together = rehearse([Job(start, steps, physical) for physical in draws])
     for one, physical in zip(together, draws, strict=True):
@@ -162,7 +163,7 @@ def test_draws_of_the_same_actions_are_rehearsed_as_each_alone():
 def test_a_rehearsal_that_diverges_says_so():
     step = Step(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     physical = Posterior.of(MadeUpDlo()).best
-    found, = Rehearser(ToySimulator(fail_below=101))([Job(straight(), (step,), physical)])
+    found, = Rehearser(Pool(ToySimulator(fail_below=101)))([Job(straight(), (step,), physical)])
     assert 'diverged' in found.failure
     assert np.isnan(found.chains).all()
 

@@ -14,15 +14,16 @@ import pytest
 from toy_messages import toy_trials
 
 from dlo_calibration import Action, Chain, Goal, Hand, InputError
+from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.report.animation import write_animation
 from dlo_calibration.report.drawing import Drawn, hand_colours, session_picture, trial_panels, View
 from dlo_calibration.report.figure import blank_figure, SIMULATED
+from dlo_calibration.simulation import core
 from dlo_calibration.simulation.motion import densely, MOST_FRAMES, simulated_motion
+from dlo_calibration.simulation.nodes import NodeLayout
 from dlo_calibration.simulation.protocol import Rollout
-from dlo_calibration.simulation.rollout import roll_out
-from dlo_calibration.simulation.script import Settling
-from dlo_calibration.simulation.script_writer import write_script
+from dlo_calibration.simulation.script import Script, Settling
 
 
 def chains_of(trial, shift=0.0):
@@ -194,40 +195,22 @@ def test_motion_has_the_simulated_chains_over_time_and_those_at_the_goals():
 
 @pytest.mark.parametrize('held_by', [(), ('left_hand',)])
 def test_instants_between_change_nothing_of_the_course(held_by):
-    class Held:
-        """Write down which nodes are held, and where."""
+    def followed(trial):
+        """Return the nodes at the goals, and after each step which of them are held, and where all are."""
+        layout, course = NodeLayout.of(trial, 11), []
+        rope = core.Rope(layout.start(None), ParameterSpace().physical({}, 1.0), 0.01, 0.0, np.zeros(3))
 
-        time_step = 0.01
-        twists = False
+        def step():
+            rope.points[rope.held] = rope.targets
+            course.append((rope.held, rope.points.copy()))
 
-        def __init__(self, points):
-            self._points, self.nodes, self.course = np.array(points), (), []
+        nodes, *_ = rope.follow(Script.of(trial, layout, 0.01, Settling()).events, step)
+        return layout.observe @ nodes, course
 
-        @property
-        def points(self):
-            return self._points.copy()
-
-        def hold(self, nodes):
-            self.nodes = nodes
-
-        def advance(self, targets, path=None, turns=None):
-            for k, target in enumerate(targets):
-                self._points[list(self.nodes)] = target
-                self.course.append((self.nodes, self._points.copy()))
-                if path is not None:
-                    path[k] = self._points
-
-    from dlo_calibration.simulation.nodes import NodeLayout
     trial, = toy_trials(1)
     trial = replace(trial, goals=(replace(trial.goals[0], held_by=held_by),))
-    courses = []
-    for one in (trial, densely(trial)):
-        layout = NodeLayout.of(one, 11)
-        stepper = Held(layout.points)
-        courses.append((roll_out(
-            write_script(one, layout, stepper.time_step, Settling()), stepper), stepper.course))
-    (plain, before), (dense, after) = courses
-    assert np.allclose(plain.chains[-1], dense.chains[[g.stable for g in densely(trial).goals].index(True)])
+    (plain, before), (dense, after) = followed(trial), followed(densely(trial))
+    assert np.allclose(plain[-1], dense[[goal.stable for goal in densely(trial).goals].index(True)])
     assert bool(before[-1][0]) == bool(after[-1][0]) == bool(held_by)
 
 

@@ -7,7 +7,6 @@ import functools
 import json
 import logging
 import os
-from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -15,7 +14,6 @@ import time
 
 from graph import child, ended, LATCHED, PATIENCE, robot_of, TYPES, values, whole
 from live import LOG_WARN
-from processes import children
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -23,7 +21,7 @@ from result_message import result_values
 from rosgraph_msgs.msg import Clock
 from serial import serial
 from toy_messages import session_messages
-from toy_simulator import Deadly, ToySimulator
+from toy_simulator import ToySimulator
 
 from dlo_calibration import InputError
 from dlo_calibration.calibration.options import declarations
@@ -95,18 +93,6 @@ def test_session_over_the_graph_gives_a_result_and_the_replay_the_same(start_nod
     assert page.count(' seen from above: ') == 3
     kinds = {record.name for record in read_session(folder).records}
     assert kinds == {*INPUT_TYPES, *OUTPUT_TYPES}
-
-
-def test_a_process_that_died_is_told_in_log_status_and_result(start_node, tmp_path):
-    robot = start_node(Deadly(tmp_path / 'died'), workers=2, evaluations=60, search='random')
-    robot.send(session_messages(TYPES, 2))
-    robot.until_status(trials='2')
-    assert robot.call('start').success
-    result = robot.until_result()
-    assert 'was killed by SIGKILL' in whole(result)['warnings']
-    for topic in (robot.heard['log'], [one.status[0] for one in robot.heard['status']]):
-        texts = [getattr(one, 'msg', '') or getattr(one, 'message', '') for one in topic]
-        assert any('was killed by SIGKILL' in text for text in texts), texts
 
 
 def test_late_listener_gets_all_that_is_latched(start_node):
@@ -299,18 +285,15 @@ def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_pa
 
 
 @pytest.mark.long
-def test_killed_node_leaves_a_readable_session_and_no_processes(ros_environment, tmp_path, capsys):
+def test_killed_node_leaves_a_readable_session(ros_environment, tmp_path, capsys):
     with child(ros_environment, tmp_path / 'out', '-p', 'workers:=2', '-p', 'evaluations:=10000',
                seconds=0.01) as process, robot_of(ros_environment) as robot:
         robot.send(session_messages(TYPES, 2))
         robot.until_status(trials='2')
         robot.call('start')
         robot.until(lambda: robot.heard['progress'])
-        started = children(process.pid)
-        assert len(started) >= 2
         process.kill()
         process.wait()
-        robot.until(lambda: not any(Path(f'/proc/{pid}').exists() for pid in started))
     folder, = folders(tmp_path / 'out')
     session = read_session(folder)
     assert sorted(kind for kind, _ in session.messages) == sorted([INITIAL, ACTION, GOAL] * 2)

@@ -17,7 +17,7 @@ from planner_robot import PlannerRobot
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from toy_planner import CHAIN, description, NoProcesses, RESULT, ToyPlan
+from toy_planner import CHAIN, description, RESULT, ToyPlan
 
 from dlo_calibration import Chain, InputError
 from dlo_calibration.files.result import read_description, read_result, write_result
@@ -39,7 +39,7 @@ def robot(ros_environment):
 def start(robot, plan=None, remapped=(), **parameters):
     """Start the node in this process, with a search that a test makes up."""
     robot.calibrator = PlannerNode(
-        session={'plan': plan or ToyPlan(), 'processes': NoProcesses()}, context=robot.context,
+        session={'plan': plan or ToyPlan()}, context=robot.context,
         cli_args=list(remapped),
         parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()])
     robot.executor.add_node(robot.calibrator)

@@ -88,8 +88,9 @@ def interrupted(command, environment, folder, node='calibrator'):
 
 def test_the_index_leads_to_what_was_built(environment, prefix):
     assert Path(index.get_package_prefix(NAME)) == prefix
-    done = subprocess.run([sys.executable, '-c', f'import {NAME}; print({NAME}.__file__)'], cwd='/',
-                          env=environment, capture_output=True, text=True)
+    program = f'from {NAME}.simulation.core import _core; print(_core.__file__)'
+    done = subprocess.run([sys.executable, '-c', program], cwd='/', env=environment, capture_output=True,
+                          text=True)
     assert Path(done.stdout.strip()).is_relative_to(prefix), done.stderr
 
 

@@ -425,7 +425,7 @@ def test_random_and_corner_parameter_sets_stay_finite(make):
     generator, count = np.random.default_rng(0), len(PARAMETERS)
     sets = np.concatenate([generator.integers(0, 2, (28, count)), generator.random((14, count))])
     if simulator.name == 'bullet':
-        sets = sets[::5]  # the same kernels, and far slower
+        sets = sets[::5]  # the same internal forces, and far slower
     for k, point in enumerate(sets):
         trial = (drag_trial(noise=0.001), fold_trial())[k % 2]
         values = SPACE.values(point)

@@ -6,18 +6,16 @@
 from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
-from oracles import frame_forces, least_energy
+from oracles import frame_forces, HAIRPIN, least_energy
 import pytest
 from random_examples import drawing
+from stepping import properties
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
-from dlo_calibration.simulation.kernels_carry import HAIRPIN
-from dlo_calibration.simulation.rod import RodProperties
-
 
 def coiled(curvature, **rest):
-    return RodProperties(2e-3, 1e4, 0.05, 1.0, 0.05, natural_curvature=curvature, **rest)
+    return properties(2e-3, 1e4, 0.05, 1.0, 0.05, natural_curvature=curvature, **rest)
 
 
 def bent(rest, seed=0):
@@ -31,7 +29,7 @@ def bent(rest, seed=0):
 def go_on(rod, points, steps=3000, step=0.004):
     velocities = np.zeros_like(points)
     for _ in range(steps):
-        velocities = rod.velocities(points, velocities, NONE, np.zeros((len(rod.state.held), 3)))
+        velocities = rod.velocities(points, velocities, NONE, np.zeros((len(rod.rope.held), 3)))
         points = points + step * velocities
     return points, velocities
 
@@ -86,15 +84,14 @@ def test_forces_of_the_material_frame_are_the_slope_of_its_least_energy(seed, wi
     rod.frame_forces(points)
     rod.turned(points, {8: generator.normal(0, 2, 3)} if len(held) > 2 else {})
     got = rod.frame_forces(points, 100)
-    state = rod.state.frame
-    clamps = [(segment, clamp[:3]) for (segment, _), clamp in zip(state.clamped, state.clamps, strict=True)]
+    state = rod.state
     assert got == pytest.approx(frame_forces(points, state), abs=1e-9 * np.abs(got).max())
     for index in np.ndindex(points.shape):
         if index[0] not in held:
             moved = np.zeros_like(points)
             moved[index] = 1e-6
-            expected = (least_energy(points - moved, state, clamps)[0]
-                        - least_energy(points + moved, state, clamps)[0]) / 2e-6
+            expected = (least_energy(points - moved, state, state.clamps)[0]
+                        - least_energy(points + moved, state, state.clamps)[0]) / 2e-6
             assert got[index] == pytest.approx(expected, abs=1e-5 * np.abs(got).max())
 
 
@@ -103,15 +100,15 @@ def test_forces_of_the_material_frame_are_the_slope_of_its_least_energy(seed, wi
        st.sampled_from([0.0, 0.3]))
 def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step, torsion):
     rest = np.random.default_rng(seed).uniform(0.02, 0.05, 15)
-    properties = RodProperties(bending, 1e3, 0.05, natural_curvature=curvature, torsion=torsion)
-    rod = Rod(rest, properties, step)
+    physical = properties(bending, 1e3, 0.05, natural_curvature=curvature, torsion=torsion)
+    rod = Rod(rest, physical, step)
     points = crumpled(seed, rest, 0.1)
     velocities = np.zeros_like(points)
 
     def total():
-        return energy(points, rest, properties) + least_energy(points, rod.state.frame)[0] + (
+        return energy(points, rest, physical) + least_energy(points, rod.state)[0] + (
             rod.state.masses[:, None] * velocities**2).sum() / 2 + (
-                (curvature**2 * properties.bending_stiffness * rest.sum()) / 2)
+                (curvature**2 * physical['flexibility'] * rest.sum()) / 2)
 
     rod.frame_forces(points)
     start = total()
@@ -126,7 +123,7 @@ def test_energy_of_a_coiled_rod_never_grows(seed, bending, curvature, step, tors
 @given(st.integers(0, 2**32 - 1))
 def test_a_coiled_rod_neither_flies_away_nor_begins_to_spin(seed):
     rest = np.random.default_rng(seed).uniform(0.02, 0.05, 12)
-    rod = Rod(rest, RodProperties(1e-3, 1e3, 0.05, natural_curvature=5.0, torsion=float(seed % 2)), 1e-7)
+    rod = Rod(rest, properties(1e-3, 1e3, 0.05, natural_curvature=5.0, torsion=float(seed % 2)), 1e-7)
     points = crumpled(seed, rest, 0.3)
     pushed = rod.state.masses[:, None] * rod.velocities(points, np.zeros_like(points), NONE, FREE) / 1e-7
     assert np.abs(pushed.sum(axis=0)).max() < 1e-6 * np.abs(pushed).max()

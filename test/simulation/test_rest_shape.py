@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
+from stepping import properties
 from stepping import SteppedRod as Rod
 from test_rod import GRAVITY, NONE, straight
 
@@ -15,14 +16,13 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.bullet import BulletSimulator
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.simulation.rod import RodProperties
 
 
 def settled(rod, points, gravity=NONE, steps=2000):
     velocities = np.zeros_like(points)
     for _ in range(steps):
-        velocities = rod.velocities(points, velocities, gravity, np.zeros((len(rod.state.held), 3)))
-        points = points + rod.state.step * velocities
+        velocities = rod.velocities(points, velocities, gravity, np.zeros((len(rod.rope.held), 3)))
+        points = points + rod.time_step * velocities
     return points
 
 
@@ -35,7 +35,7 @@ def test_a_coiled_cantilever_hangs_like_the_elastica(torsion, curvature):
     """
     stiffness, load = 2e-3, 0.05 * 9.81 / 2e-3
     rest = np.concatenate([[0.01], np.full(40, 0.01)])
-    rod = Rod(rest, RodProperties(stiffness, 1e4, 0.05 * rest.sum(), 4.0, 0.03,
+    rod = Rod(rest, properties(stiffness, 1e4, 0.05 * rest.sum(), 4.0, 0.03,
                                   natural_curvature=abs(curvature), torsion=torsion), 0.004)
     rod.hold((0, 1))
     points = straight(rest)
@@ -62,7 +62,7 @@ def test_a_twisted_ring_leaves_its_plane_when_twisted_too_much(share, leaves):
     points = 0.25 * np.stack([np.sin(corners), 1 - np.cos(corners), 0 * corners], axis=1)
     points = np.concatenate([[[-1e-3, 0, 0]], points, [[1e-3, 0, 0]]])
     rest = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    rod = Rod(rest, RodProperties(1e-3, 1e4, 0.05, 1.0, 0.005, torsion=torsion), 0.004)
+    rod = Rod(rest, properties(1e-3, 1e4, 0.05, 1.0, 0.005, torsion=torsion), 0.004)
     rod.hold((0, 1, count + 1, count + 2))
     points[2:-2] += 1e-5 * np.random.default_rng(0).normal(size=(count - 1, 3))
     rod.frame_forces(points)
@@ -77,7 +77,7 @@ def test_a_twisted_ring_leaves_its_plane_when_twisted_too_much(share, leaves):
 
 def test_a_clamp_that_turns_carries_the_coil_around():
     rest = np.concatenate([[0.01], np.full(24, 0.02)])
-    rod = Rod(rest, RodProperties(2e-3, 1e4, 0.05, 3.0, 0.02, natural_curvature=2.5, torsion=1.0), 0.004)
+    rod = Rod(rest, properties(2e-3, 1e4, 0.05, 3.0, 0.02, natural_curvature=2.5, torsion=1.0), 0.004)
     rod.hold((0, 1))
     points = straight(rest)
     points[2:, 1] += 0.5 * 2.5 * (points[2:, 0] - 0.01)**2
@@ -92,15 +92,16 @@ def test_free_ends_and_pins_bear_no_torque():
     rest = np.full(20, 0.03)
     shape = tuple(np.random.default_rng(1).normal(0, 4, (5, 2)))
     for held in ((), (0, 20), (0, 1, 20)):
-        rod = Rod(rest, RodProperties(2e-3, 1e4, 0.05, 3.0, 0.02, torsion=0.8, rest_curvature=shape), 0.004)
+        rod = Rod(rest, properties(2e-3, 1e4, 0.05, 3.0, 0.02, torsion=0.8, rest_curvature=shape), 0.004)
         rod.hold(held)
         points = straight(rest) + 0.003 * np.random.default_rng(2).normal(size=(21, 3))
         points = settled(rod, points, GRAVITY if held else NONE, 800)
-        state = rod.state.frame
+        state = rod.state
         moments = state.twisting * np.diff(state.angles)
-        one, two = (state.natural[:, 0] * state.joints[:, 3] - state.natural[:, 1] * state.joints[:, 4],
-                    state.natural[:, 0] * state.joints[:, 4] + state.natural[:, 1] * state.joints[:, 3])
-        slopes = (state.joints[:, 0] * two - state.joints[:, 1] * one) / 2
+        bends, cosine, sine = state.joints[:, :2], state.joints[:, 4], state.joints[:, 5]
+        one, two = (state.natural[:, 0] * cosine - state.natural[:, 1] * sine,
+                    state.natural[:, 0] * sine + state.natural[:, 1] * cosine)
+        slopes = (bends[:, 0] * two - bends[:, 1] * one) / 2
         torques = np.concatenate([moments - slopes, [0.0]]) - np.concatenate([[0.0], moments + slopes])
         assert np.abs(torques[1 if 1 in held else 0:]).max() < 2e-3 * np.abs(moments).max()
 

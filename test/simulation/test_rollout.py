@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The course of a trial on a stepper that is easy to predict: free nodes sink, held ones follow."""
+"""The course of a trial on an engine that is easy to predict: free nodes sink, held ones follow."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,10 +10,10 @@ import pytest
 from random_examples import drawing
 
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
-from dlo_calibration.simulation.nodes import NodeLayout
-from dlo_calibration.simulation.rollout import roll_out
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.simulation import core
+from dlo_calibration.simulation.engine import Engine
 from dlo_calibration.simulation.script import Settling
-from dlo_calibration.simulation.script_writer import write_script
 
 STEP = 0.01
 POINTS = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.zeros(11)], axis=1)
@@ -22,42 +22,37 @@ SPEED = 0.1  # m/s at which free nodes sink
 QUARTER = [[0, 0, 0, 1], [0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)]]  # a turn about z
 
 
-class Sinking:
+class Sinking(Engine):
     """Free nodes sink at constant speed until that many seconds were simulated."""
 
-    def __init__(self, points, until):
-        self.time_step = STEP
-        self.twists = False
-        self._points = np.array(points)
+    name = 'sinking'
+
+    def __init__(self, until, **settings):
+        super().__init__(table=False, time_step=STEP, **settings)
         self._left = round(until / STEP) if np.isfinite(until) else np.inf
-        self._held = []
 
-    @property
-    def points(self):
-        return self._points.copy()
+    def simulate(self, trial, physical):
+        known, start, _ = self._prepare(trial, physical)
+        rope = core.Rope(start, physical, STEP, 0.0, np.zeros(3))
 
-    def hold(self, nodes):
-        assert len(set(nodes)) == len(nodes)
-        self._held = list(nodes)
-
-    def advance(self, targets, path=None, turns=None):
-        assert targets.shape[1:] == (len(self._held), 3)
-        for k, target in enumerate(targets):
+        def step():
+            assert len(set(rope.held)) == len(rope.held)
+            assert rope.targets.shape == (len(rope.held), 3)
             if self._left > 0:
-                free = np.setdiff1d(np.arange(len(self._points)), self._held)
-                self._points[free, 2] -= SPEED * STEP
+                free = np.setdiff1d(np.arange(len(rope.points)), rope.held)
+                rope.points[free, 2] -= SPEED * STEP
             self._left -= 1
-            self._points[self._held] = target
-            if path is not None:
-                path[k] = self._points
+            rope.points[rope.held] = rope.targets
+
+        return self._rollout(known, rope.follow(known.script.events, step))
 
 
 def rolled(hands, goals, until=np.inf, settling=None, nodes=11):
     actions = [Action(hand if isinstance(hand, tuple) else (hand,)) for hand in hands]
-    trial = Trial('t', CHAIN, actions, goals)
-    layout = NodeLayout.of(trial, nodes)
-    script = write_script(trial, layout, STEP, settling or Settling())
-    return roll_out(script, Sinking(layout.points, until))
+    settling = settling or Settling()
+    sinking = Sinking(until, nodes=nodes, stable_distance=settling.distance, stable_time=settling.time,
+                      settle_limit=settling.limit)
+    return sinking.simulate(Trial('t', CHAIN, actions, goals), ParameterSpace().physical({}, 1.0))
 
 
 def timed(time, held_by=()):

@@ -3,6 +3,7 @@
 
 """Several rollouts at once are those that each would be by itself, bit for bit."""
 
+from concurrent.futures import CancelledError
 from dataclasses import replace
 
 from carried import carried
@@ -18,10 +19,8 @@ from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation import engine
 from dlo_calibration.simulation.compiled import CompiledSimulator
-from dlo_calibration.simulation.kernel_cache import compile_kernels, TOGETHER
+from dlo_calibration.simulation.core import Stop
 from dlo_calibration.simulation.protocol import simulate_all
-
-compile_kernels(TOGETHER)
 
 PAPERS = ('flexibility', 'elasticity', 'friction', 'self_collision')
 CABLES = (*PAPERS[:2], 'damping', 'internal_damping', 'torsion', 'bending_friction', 'bending_slip',
@@ -35,13 +34,9 @@ def drawn(names, count, seed=7, low=0.1, high=0.9):
             for _ in range(count)]
 
 
-def nothing():
-    """Do nothing between two pieces of a simulation."""
-
-
 def same(simulator, jobs):
     """Tell of each job whether it is the same alone and together with the others."""
-    together = list(simulate_all(simulator, jobs, nothing))
+    together = simulate_all(simulator, jobs, Stop())
     assert len(together) == len(jobs)
     for (trial, physical), got in zip(jobs, together, strict=True):
         try:
@@ -103,7 +98,7 @@ def test_one_that_diverges_does_not_disturb_the_others():
     good, = drawn(CABLES, 1)
     jobs = [(carried(0.1, 0.2), {**good, **changes}) for changes in (
         {}, {'flexibility': float('nan')}, {'damping': 2.0}, {'elasticity': float('nan')}, {'damping': 3.0})]
-    together = list(simulate_all(simulator, jobs, nothing))
+    together = simulate_all(simulator, jobs, Stop())
     assert [isinstance(one, SimulationError) for one in together] == [False, True, False, True, False]
     assert all(same(simulator, jobs))
 
@@ -115,8 +110,8 @@ def test_what_was_simulated_before_makes_no_difference():
             {'self_collision': 0.012, 'stiffness_2': 3.0}]
     jobs = [(trial, {**physical, **one}) for physical in drawn(CABLES, 2) for trial in trials for one in sets]
     for _ in range(2):
-        for job, found in zip(jobs, simulate_all(used, jobs, nothing), strict=True):
-            new = list(simulate_all(CompiledSimulator(table=False, nodes=21), [job], nothing))
+        for job, found in zip(jobs, simulate_all(used, jobs, Stop()), strict=True):
+            new = simulate_all(CompiledSimulator(table=False, nodes=21), [job], Stop())
             assert [str(one) for one in new] == [str(found)] if isinstance(found, SimulationError) else (
                 new[0].chains.tobytes() == found.chains.tobytes())
         jobs.reverse()
@@ -125,23 +120,25 @@ def test_what_was_simulated_before_makes_no_difference():
 @pytest.mark.parametrize('rows', [0, 500])
 def test_scripts_that_are_too_long_to_keep_are_written_again(rows, monkeypatch):
     jobs = [(trial, physical) for physical in drawn(CABLES, 2) for trial in (carried(0.1, 0.2), turned(1.0))]
-    expected = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
+    expected = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
     monkeypatch.setattr(engine, 'MOST_POSITIONS', rows)
-    found = list(simulate_all(CompiledSimulator(table=False, nodes=21), jobs, nothing))
+    found = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
     assert [one.chains.tobytes() for one in found] == [one.chains.tobytes() for one in expected]
 
 
 def test_whoever_asks_can_end_it():
-    class Enough(Exception):
-        pass
+    jobs = [(carried(0.1, 0.2), physical) for physical in drawn(CABLES, 8)]
+    compiled, stop, begun = CompiledSimulator(table=False, nodes=21), Stop(), []
 
-    calls = []
+    class OneByOne:
+        def simulate(self, trial, physical):
+            begun.append(physical)
+            if len(begun) == 3:
+                stop.set()
+            return compiled.simulate(trial, physical)
 
-    def between():
-        calls.append(1)
-        if len(calls) == 3:
-            raise Enough
-
-    with pytest.raises(Enough):
-        list(simulate_all(CompiledSimulator(table=False, nodes=21), [
-            (carried(0.1, 0.2), physical) for physical in drawn(CABLES, 8)], between))
+    with pytest.raises(CancelledError):
+        simulate_all(OneByOne(), jobs, stop)
+    assert len(begun) == 3
+    with pytest.raises(CancelledError):
+        simulate_all(compiled, jobs, stop)

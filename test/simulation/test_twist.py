@@ -5,20 +5,19 @@
 
 import numpy as np
 import pytest
+from stepping import properties, SteppedRope
 from stepping import SteppedRod as Rod
 from test_rod import crumpled, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation.compiled import CompiledRope
-from dlo_calibration.simulation.rod import RodProperties
 
 ENDS = (0, 1, 11, 12)
-CLAMPED = RodProperties(1e-2, 500.0, 0.05, torsion=0.7)
+CLAMPED = properties(1e-2, 500.0, 0.05, torsion=0.7)
 
 
-def held(points, nodes=ENDS, properties=CLAMPED):
+def held(points, nodes=ENDS):
     """Return a rod whose clamps have just closed, as they find it."""
-    rod = Rod(np.full(len(points) - 1, 0.05), properties, 1e-8)
+    rod = Rod(np.full(len(points) - 1, 0.05), CLAMPED, 1e-8)
     rod.hold(nodes)
     rod.frame_forces(points)
     return rod
@@ -27,7 +26,7 @@ def held(points, nodes=ENDS, properties=CLAMPED):
 def moments(rod, points):
     """Return the (N - 2,) [N m] twisting moments at rest."""
     rod.frame_forces(points, 100)
-    state = rod.state.frame
+    state = rod.state
     return state.twisting * np.diff(state.angles) if len(state.angles) else np.zeros(len(points) - 2)
 
 
@@ -89,7 +88,7 @@ def test_what_stays_between_the_same_clamps_stays_twisted():
 def test_a_twisted_straight_rod_stays_straight_until_twisted_too_much(turns, buckles):
     """Greenhill: a clamped rod buckles at a torque of 8.987 EI / L; here just below and just above."""
     rest = np.full(42, 0.025)
-    rod = Rod(rest, RodProperties(1e-3, 1e4, 0.05, 1.0, 0.02, torsion=1.0), 0.004)
+    rod = Rod(rest, properties(1e-3, 1e4, 0.05, 1.0, 0.02, torsion=1.0), 0.004)
     rod.hold((0, 1, 41, 42))
     points = straight(rest)
     points[2:-2] += 1e-4 * np.random.default_rng(0).normal(size=(39, 3))
@@ -109,7 +108,7 @@ def test_torsion_changes_a_loop_between_two_clamps_and_nothing_else():
         rest = np.full(20, 0.03)
         points = straight(rest)
         physical = {**ParameterSpace().physical({}, 0.6), 'torsion': torsion, 'flexibility': 1e-3}
-        rope = CompiledRope(points[:, 0], points, np.zeros((21, 3)), physical, 0.004)
+        rope = SteppedRope(points[:, 0], points, np.zeros((21, 3)), physical, 0.004)
         rope.hold(clamps)
         way = np.linspace(0, 1, 500)[:, None, None] * (-0.45, 0.1, 0.0)
         still = np.array([0.0 if node < 10 else 1.0 for node in clamps])[:, None]

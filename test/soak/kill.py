@@ -2,23 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Kill: kill -9 to the node while it collects, calibrates or writes a result, and to processes that simulate.
+Kill: kill -9 to the node while it collects, calibrates or writes a result.
 
-Lost: a trial that the node told of and that its session does not give back, a result that is cut, or another
-result after a process that simulates was killed.  Died: a node that ends by itself, or leaves one behind.
+Lost: a trial that the node told of and that its session does not give back, or a result that is cut.
+Died: a node that ends by itself, or leaves a process behind.
 """
 
 from __future__ import annotations
 
 from contextlib import contextmanager
-import os
 from pathlib import Path
 import random
-import signal
 import time
 
 from domain import ros_graph
-from processes import children, simulating
+from processes import children
 from tally import peak_of, Tally
 from toy_messages import session_messages
 
@@ -29,33 +27,24 @@ from dlo_calibration.files.session import read_session, session_trials
 
 FULL = 110
 ORPHANED = 5.0  # s that a process may outlive the node
-MOMENTS = ('calibrating', 'a process', 'writing', 'collecting')
-EVALUATIONS = {'calibrating': 10000, 'a process': 60, 'writing': 20, 'collecting': 20}
+MOMENTS = ('calibrating', 'writing', 'collecting')
+EVALUATIONS = {'calibrating': 10000, 'writing': 20, 'collecting': 20}
 TRIALS = 2  # before the calibration
 
 
 def conduct(amount: int, seed: int, folder: Path) -> Tally:
     """Kill `amount` times, at the moments in turn."""
     tally, choose = Tally(), random.Random(seed)
-    scores: set[str] = set()  # of calibrations of which processes were killed, and of one without
-    if amount > MOMENTS.index('a process'):
-        with _node(folder / 'whole', EVALUATIONS['a process']) as (process, robot):
-            scores.add(_scores(robot))
     for k in range(amount):
         moment = MOMENTS[k % len(MOMENTS)]
         tally.tried += 1
         try:
             with _node(folder / f'{k}', EVALUATIONS[moment]) as (process, robot):
-                if moment == 'a process':
-                    scores.add(_kill_a_process(process, robot, choose))
-                else:
-                    _kill_the_node(process, robot, moment, choose, tally)
+                _kill_the_node(process, robot, moment, choose, tally)
         except AssertionError:  # it ended, or never answered
             tally.died += 1
             continue
-        if moment != 'a process':
-            tally.lost += _lost(folder / f'{k}' / 'out', robot)
-    tally.lost += max(len(scores) - 1, 0)
+        tally.lost += _lost(folder / f'{k}' / 'out', robot)
     return tally
 
 
@@ -71,30 +60,6 @@ def _node(folder, evaluations):
         robot.send(session_messages(TYPES, TRIALS))
         robot.until_status(trials=f'{TRIALS}')
         yield process, robot
-
-
-def _simulating(process):
-    return simulating(process.pid)
-
-
-def _scores(robot):
-    """Return the scores of the result of a calibration, which begins now if none is under way."""
-    from graph import whole
-
-    if not robot.heard['progress']:
-        assert robot.call('start').success
-    return whole(robot.until_result())['scores']
-
-
-def _kill_a_process(process, robot, choose):
-    """Kill one of the processes that simulate; return the scores of the result."""
-    assert robot.call('start').success
-    robot.until(lambda: robot.heard['progress'] and len(_simulating(process)) > 1)
-    try:
-        os.kill(choose.choice(_simulating(process)), signal.SIGKILL)
-    except ProcessLookupError:
-        pass  # the calibration has just ended
-    return _scores(robot)
 
 
 def _kill_the_node(process, robot, moment, choose, tally):

@@ -94,7 +94,7 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
     session = write_session(folder / 'session', session_messages(bag_types(), 3), {**SMALL, **choice})
     words = ('fit', session, '--seed', choose.randrange(1000), '--json', '--workers')
     out = folder / 'out'
-    # Two processes also simulate points twice that are twice in one batch.
+    # Two threads also simulate points twice that are twice in one batch.
     whole = live(folder, *words, workers, '--output', folder / 'whole')
     expected, kills, told, simulations, slack = contents(folder / 'whole'), 0, 0, 0, 0
     while True:
@@ -111,7 +111,7 @@ def of_fit(folder: Path, tally: Tally, choose: random.Random, choice: dict[str, 
         told, simulations = max(told, life.told), simulations + life.simulations
         if life.code != -signal.SIGKILL or limit is None:
             break
-        # Each process was simulating an evaluation, and had perhaps finished another just now.
+        # Each thread was simulating an evaluation, and had perhaps finished another just now.
         kills, slack = kills + 1, slack + 2 * here * len(toy_trials(3))
     if life.code != 0:
         tally.died += 1

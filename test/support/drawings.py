@@ -11,17 +11,12 @@ from dlo_calibration.report.figure import Panel
 from dlo_calibration.ros import report_writer
 
 
-class _InThread(ThreadPoolExecutor):
-    """In place of a process, in which drawings could not be left out."""
-
-    close = ThreadPoolExecutor.shutdown
-
-
 def leave_out_drawings(replace=setattr):
     """Let the page of a result have its words only; `replace` sets an attribute of a module."""
+    # A thread in place of a process, in which drawings could not be left out.
+    replace(report_writer, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(1))
     for module in (bending_drawing, drawing, landscape):
         replace(module, 'panel', lambda draw, words, legend=True: Panel('data:,', words))
-    replace(report_writer, 'ProcessExecutor', _InThread)
 
 
 def leave_out_slices(replace=setattr):

@@ -19,18 +19,25 @@ class Mortal(ToySimulator):
     A toy that counts its simulations, and dies at one of them.
 
     :param name: of the engine.
-    :param last: number of the simulation at which `die` is called.
+    :param last: number of the simulation at which, and from which on, `die` is called.
+    :param counted: has one item for each simulation; engines may share it.
     """
 
-    def __init__(self, name='toy', last=None, die=None):
+    def __init__(self, name='toy', last=None, die=None, counted=None):
         super().__init__(fail_below=20.0)
-        self.name, self.count, self.last, self.die = name, 0, last, die
+        self.name, self.last, self.die = name, last, die
+        self.counted = [] if counted is None else counted
+
+    @property
+    def count(self):
+        """Number of simulations so far."""
+        return len(self.counted)
 
     def simulate(self, trial, physical):
         """Count, and do what the toy does; it trembles, so that the residuals need an explanation."""
-        self.count += 1
-        if self.count == self.last:
+        if self.last is not None and len(self.counted) >= self.last - 1:
             self.die()
+        self.counted.append(trial.name)
         return super().simulate(trial, {**physical, 'friction': physical['friction'] * 1.1})
 
 

@@ -1,29 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The physics of `kernels` once more, in NumPy, to compare with: short, and not made to be fast."""
+"""The physics of the core once more, in NumPy, to compare with: short, and not made to be fast."""
 
 import math
 
 import numpy as np
 
-from dlo_calibration.simulation.kernels import HELD
-from dlo_calibration.simulation.kernels_carry import HAIRPIN
-from dlo_calibration.simulation.kernels_contact import (
-    FASTEST_PUSH_OUT,
-    ITERATIONS,
-    PUSH_OUT,
-    SUPPORTED,
-    TINY,
-    UNSUPPORTED,
-    WEDGED,
-)
-from dlo_calibration.simulation.kernels_frame import ROUNDED
+# The core's constants; its headers explain them.
+HELD = 1e12
+HAIRPIN = 0.01
+ROUNDED = 0.05
+ITERATIONS, PUSH_OUT, FASTEST_PUSH_OUT = 10, 0.8, 0.8
+SUPPORTED, UNSUPPORTED, WEDGED, TINY = 0.5, 1e-6, 0.1, 1e-12
 
 
 def rod_velocities(rod, points, velocities):
     """Return the (N, 3) [m/s] velocities after one step, by a dense matrix."""
-    diagonal, first, second = rod.bending
+    diagonal, first, second = rod.bending.T
     bending = np.diag(diagonal)
     for offset, band in ((1, first[:-1]), (2, second[:-2])):
         bending += np.diag(band, offset) + np.diag(band, -offset)
@@ -38,8 +32,8 @@ def rod_velocities(rod, points, velocities):
         block = (rod.stiffness[i] - across) * np.outer(segment, segment) / (segment @ segment)
         ends = np.kron([[1, -1], [-1, 1]], block + across * np.eye(3))
         matrix[3 * i:3 * i + 6, 3 * i:3 * i + 6] += rod.implicit * ends
-    if len(rod.frame.angles):
-        forces += frame_forces(points, rod.frame)
+    if len(rod.angles):
+        forces += frame_forces(points, rod)
     right = rod.masses[:, None] * velocities + rod.step * forces
     pull = HELD * rod.masses[rod.held, None]
     right[rod.held] += pull * rod.follow
@@ -82,7 +76,7 @@ def frame_forces(points, state):
     """Return the forces of the material frame on the nodes, (N, 3) [N], at the angles that it has."""
     tangents, frame, lengths, bends, half = bends_along(points, state.carried[1])
     natural = state.natural[:, 0] + 1j * state.natural[:, 1]
-    if len(state.twisting):
+    if state.twisting.any():
         natural = natural * np.exp(0.5j * (state.angles[1:] + state.angles[:-1]))
         twists = state.twisting * np.diff(state.angles)
     else:  # it turns freely as a whole
@@ -117,7 +111,7 @@ def least_energy(points, state, clamps=(), near=None):
     _, frame, _, bends, _ = bends_along(points, state.carried[1])
     tangents = np.diff(points, axis=0) / np.linalg.norm(np.diff(points, axis=0), axis=1)[:, None]
     natural = state.natural[:, 0] + 1j * state.natural[:, 1]
-    if not len(state.twisting):
+    if not state.twisting.any():
         return -np.hypot(abs(natural.conj() @ bends), ROUNDED * np.abs(natural).mean()), None
     angles = np.array(state.angles if near is None else near)
     for segment, direction in clamps:
@@ -161,13 +155,14 @@ def _angle(first, second, tangent):
     return math.atan2(np.cross(first, second) @ tangent, first @ second)
 
 
-def kept_apart(contact, points, velocities, inverse_masses, support, step):
+def kept_apart(contact, friction, points, velocities, inverse_masses, support, step):
     """Return the (N, 3) [m/s] velocities that contacts allow; every pair that may touch is looked at."""
-    middles, half = contact.middles, contact.half
+    middles, half = contact['middles'], contact['half']
+    distances = contact['distances'].reshape(len(half), -1)
     between = middles[None, :] - middles[:, None] - half[None, :] - half[:, None]
-    first, second = np.nonzero(between > contact.apart)
+    first, second = np.nonzero(between > contact['apart'])
     s, t, normal, distance = closest(points, first, second)
-    gap = distance - np.maximum(contact.distances[first, second], np.minimum(distance, contact.diameter))
+    gap = distance - np.maximum(distances[first, second], np.minimum(distance, contact['diameter']))
     wanted = np.where(gap > 0, -gap / step, np.minimum(-PUSH_OUT * gap / step, FASTEST_PUSH_OUT))
     nodes = np.stack([first, first + 1, second, second + 1], axis=1)
     weights = np.stack([1 - s, s, -(1 - t), -t], axis=1)
@@ -191,7 +186,7 @@ def kept_apart(contact, points, velocities, inverse_masses, support, step):
         push = np.maximum(pushed + (wanted - approach) / mobility[:, 0], 0)
         rub = rubbed - (relative - approach[:, None] * normal) / mobility
         size = np.linalg.norm(rub, axis=1)
-        rub *= np.minimum(1, contact.friction * push / np.maximum(size, TINY))[:, None]
+        rub *= np.minimum(1, friction * push / np.maximum(size, TINY))[:, None]
         impulses = (push - pushed)[:, None] * normal + rub - rubbed
         pushed, rubbed = push, rub
         np.add.at(resolved, nodes, (weights * yielding)[:, :, None] * impulses[:, None, :])

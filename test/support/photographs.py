@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import math
 
 import cv2
-import numba
 import numpy as np
 
 STEP = 8  # px between the pixels whose rays are computed; between them they are interpolated
@@ -400,79 +399,65 @@ def _surface(capsule, normals, arc, radius, look, generator):
     return colour * (1 + 0.04 * generator.standard_normal((len(arc), 1), dtype=np.float32))
 
 
-@numba.njit(cache=True)
 def _ray(rays, u, v):
-    """Interpolate the undistorted coordinates of a pixel."""
+    """Interpolate the undistorted coordinates of pixels."""
     x, y = u / STEP + 1, v / STEP + 1
-    i, j = min(max(int(y), 0), rays.shape[0] - 2), min(max(int(x), 0), rays.shape[1] - 2)
-    y, x = y - i, x - j
-    a = (1 - x) * rays[i, j, 0] + x * rays[i, j + 1, 0]
-    b = (1 - x) * rays[i + 1, j, 0] + x * rays[i + 1, j + 1, 0]
-    c = (1 - x) * rays[i, j, 1] + x * rays[i, j + 1, 1]
-    d = (1 - x) * rays[i + 1, j, 1] + x * rays[i + 1, j + 1, 1]
-    return (1 - y) * a + y * b, (1 - y) * c + y * d
+    i = np.clip(y.astype(int), 0, rays.shape[0] - 2)
+    j = np.clip(x.astype(int), 0, rays.shape[1] - 2)
+    y, x = (y - i)[..., None], (x - j)[..., None]
+    above = (1 - x) * rays[i, j] + x * rays[i, j + 1]
+    below = (1 - x) * rays[i + 1, j] + x * rays[i + 1, j + 1]
+    found = (1 - y) * above + y * below
+    return found[..., 0], found[..., 1]
 
 
-@numba.njit(cache=True)
 def _table_map(rays, rotation, position, width, height):
     """Return where on the table (x, y) [m] each pixel looks."""
     places = np.empty((height, width, 2), dtype=np.float32)
     for v in range(height):
-        for u in range(width):
-            x, y = _ray(rays, u, v)
-            down = x * rotation[0, 2] + y * rotation[1, 2] + rotation[2, 2]
-            reach = -position[2] / min(down, -0.02)
-            for k in range(2):
-                places[v, u, k] = position[k] + reach * (
-                    x * rotation[0, k] + y * rotation[1, k] + rotation[2, k])
+        x, y = _ray(rays, np.arange(float(width)), np.full(width, float(v)))
+        along = x[:, None] * rotation[0] + y[:, None] * rotation[1] + rotation[2]
+        places[v] = position[:2] - (position[2] / np.minimum(along[:, 2:], -0.02)) * along[:, :2]
     return places
 
 
-@numba.njit(cache=True)
 def _hit(order, capsules, boxes, scale, rays, rotation, position, depth, which, place):
     """Find the nearest capsule that the rays of each pixel hit; `place` is the normal and the arc length."""
     height, width = order.shape
-    for k in range(len(capsules)):
-        a, b, radius = capsules[k, :3] - position, capsules[k, 3:6] - position, capsules[k, 6]
-        nearest = min(np.dot(a, rotation[2]), np.dot(b, rotation[2])) - radius
+    for k, capsule in enumerate(capsules):
+        a, b, radius = capsule[:3] - position, capsule[3:6] - position, capsule[6]
+        nearest = min(a @ rotation[2], b @ rotation[2]) - radius
         if nearest < 0.02:
             continue
         margin = radius * scale / nearest + 2
-        x1, y1, z1 = rotation @ a
-        x2, y2, z2 = rotation @ (b - a)
-        square = x2 * x2 + y2 * y2 + z2 * z2
-        start, size = x1 * x2 + y1 * y2 + z1 * z2, x1 * x1 + y1 * y1 + z1 * z1
-        for v in range(max(0, int(boxes[k, 1] - margin)), min(height, int(boxes[k, 3] + margin) + 1)):
-            for u in range(max(0, int(boxes[k, 0] - margin)), min(width, int(boxes[k, 2] + margin) + 1)):
-                row = order[v, u] - 1
-                if row < 0:
-                    continue
-                for sub in range(4):
-                    x, y = _ray(rays, u + SUBPIXELS[sub, 0], v + SUBPIXELS[sub, 1])
-                    z = 1 / math.sqrt(1 + x * x + y * y)
-                    x, y = x * z, y * z
-                    best = np.inf
-                    at = 0.0
-                    along, towards = x * x2 + y * y2 + z * z2, x * x1 + y * y1 + z * z1
-                    # the cylinder: |t ray - a - s axis| = radius
-                    p = 1 - along * along / square
-                    q = towards - along * start / square
-                    root = q * q - p * (size - start * start / square - radius * radius)
-                    if root >= 0 and p > 1e-12:
-                        t = (q - math.sqrt(root)) / p
-                        s = (t * along - start) / square
-                        if 0 <= s <= 1:
-                            best, at = t, s
-                    for end in range(2):
-                        q = towards + end * along
-                        root = q * q - (size + end * (2 * start + square)) + radius * radius
-                        if root >= 0 and q - math.sqrt(root) < best:
-                            best, at = q - math.sqrt(root), float(end)
-                    if best < depth[row, sub]:
-                        depth[row, sub] = best
-                        which[row, sub] = k
-                        x, y, z = best * x - x1 - at * x2, best * y - y1 - at * y2, best * z - z1 - at * z2
-                        for i in range(3):
-                            place[row, sub, i] = (x * rotation[0, i] + y * rotation[1, i]
-                                                  + z * rotation[2, i]) / radius
-                        place[row, sub, 3] = capsules[k, 7] + at * math.sqrt(square)
+        left, top = max(0, int(boxes[k, 0] - margin)), max(0, int(boxes[k, 1] - margin))
+        right, bottom = min(width, int(boxes[k, 2] + margin) + 1), min(height, int(boxes[k, 3] + margin) + 1)
+        v, u = np.nonzero(order[top:bottom, left:right])
+        row = order[top:bottom, left:right][v, u] - 1
+        first, axis = rotation @ a, rotation @ (b - a)
+        square, start, size = axis @ axis, first @ axis, first @ first
+        for sub in range(4):
+            x, y = _ray(rays, left + u + SUBPIXELS[sub, 0], top + v + SUBPIXELS[sub, 1])
+            ray = np.column_stack([x, y, np.ones(len(x))])
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            along, towards = ray @ axis, ray @ first
+            # the cylinder: |t ray - a - s axis| = radius
+            p = 1 - along * along / square
+            q = towards - along * start / square
+            root = q * q - p * (size - start * start / square - radius * radius)
+            with np.errstate(divide='ignore', invalid='ignore'):
+                t = (q - np.sqrt(root)) / p
+                s = (t * along - start) / square
+            hit = (root >= 0) & (p > 1e-12) & (s >= 0) & (s <= 1)
+            best, at = np.where(hit, t, np.inf), np.where(hit, s, 0.0)
+            for end in range(2):
+                q = towards + end * along
+                root = q * q - (size + end * (2 * start + square)) + radius * radius
+                t = q - np.sqrt(np.maximum(root, 0))
+                hit = (root >= 0) & (t < best)
+                best, at = np.where(hit, t, best), np.where(hit, float(end), at)
+            nearer = best < depth[row, sub]
+            rows, best, at = row[nearer], best[nearer, None], at[nearer]
+            depth[rows, sub], which[rows, sub] = best[:, 0], k
+            place[rows, sub, :3] = (best * ray[nearer] - first - at[:, None] * axis) @ rotation / radius
+            place[rows, sub, 3] = capsule[7] + at * math.sqrt(square)

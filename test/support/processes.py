@@ -6,38 +6,29 @@
 from pathlib import Path
 
 
-def children(parent):
-    """Return the command lines of a process's children, by id."""
+def _with(place, number):
+    """Return the command lines of living processes whose status has a number at a place, by id."""
     found = {}
     for folder in Path('/proc').glob('[0-9]*'):
         try:
             fields = (folder / 'stat').read_text().rpartition(')')[2].split()
-            if int(fields[1]) == parent:
+            if int(fields[place]) == number and fields[0] != 'Z':
                 found[int(folder.name)] = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
         except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
             pass
     return found
 
 
+def children(parent):
+    """Return the command lines of a process's children, by id."""
+    return _with(1, parent)
+
+
 def simulating(parent):
-    """List the ids of the processes that simulate for a process: it spawned them, or its fork server did."""
-    found = []
-    for pid, text in children(parent).items():
-        if 'spawn_main' in text:
-            found.append(pid)
-        elif 'multiprocessing.forkserver' in text:
-            found.extend(children(pid))
-    return found
+    """List the ids of the processes that simulate for a process."""
+    return [pid for pid, text in children(parent).items() if 'process_simulator' in text]
 
 
 def of_session(leader):
     """Return the command lines of the living processes that were started in a process's session, by id."""
-    found = {}
-    for folder in Path('/proc').glob('[0-9]*'):
-        try:
-            fields = (folder / 'stat').read_text().rpartition(')')[2].split()
-            if int(fields[3]) == leader and fields[0] != 'Z':
-                found[int(folder.name)] = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
-        except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
-            pass
-    return found
+    return _with(3, leader)

@@ -4,12 +4,11 @@
 """Shapes at rest of known rods, for tests."""
 
 import numpy as np
-from stepping import SteppedRod
+from stepping import properties, SteppedRod
 
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation.rod import RodProperties
 
 LENGTH = 0.6
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -23,7 +22,7 @@ def hung(bending, held, mass=0.03, stretching=1e4, nodes=61, length=LENGTH, seco
     """
     step = 0.004
     rod = SteppedRod(np.full(nodes - 1, length / (nodes - 1)),
-                     RodProperties(bending, stretching, mass, drag=3.0, internal_damping=0.01), step)
+                     properties(bending, stretching, mass, damping=3.0, internal_damping=0.01), step)
     points = np.stack([np.linspace(0, length, nodes), np.zeros(nodes), np.ones(nodes)], axis=1)
     velocities = np.zeros_like(points)
     indices = sorted(held)

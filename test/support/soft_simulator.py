@@ -38,9 +38,6 @@ class SoftSimulator:
         self.width = width
         self.unsure = unsure
 
-    def prepare(self) -> None:
-        """Need nothing."""
-
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """Return the points at each goal."""
         chains = [self._at(trial, goal.time, physical) for goal in trial.goals]

@@ -1,115 +1,136 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Single steps of the kernels, for tests."""
+"""Single steps of the core, for tests."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_calibration.simulation.entries import start_distances
-from dlo_calibration.simulation.machine_code import defined_in
-from dlo_calibration.simulation.rod import Rod
-from dlo_calibration.simulation.rope import self_contact
-from dlo_calibration.simulation.states import (
-    FrameState,
-    IndexRows,
-    Matrix,
-    RodState,
-    SelfContact,
-    SlipState,
-    Vector,
-)
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.parameters import GRAVITY
+from dlo_calibration.simulation import core
 
-PARTS = 'kernel_parts'
+NO_TABLE = -1e6  # m; height of a table that nothing touches
+ALONE = 1e6  # m; a self-collision radius with which no segments are far enough apart along a DLO to touch
 
 
-@defined_in(PARTS)
-def rod_velocities(rod: RodState, points: Matrix, velocities: Matrix, predicted: Matrix) -> int:
-    """Take a step without contacts; return 0 if it diverges."""
+def properties(flexibility, elasticity, mass, damping=0.0, internal_damping=0.0, *, profile=(1.0,),
+               rest_curvature=(), **others):
+    """
+    Return physical parameters, by name, of a DLO that does not touch itself.
+
+    :param profile: bending stiffness of parts of equal length, relative to that of the first part.
+    :param rest_curvature: pairs of components of the natural curvature [1/m].
+    """
+    parts = {f'stiffness_{part}': one for part, one in enumerate(profile[1:], start=2)}
+    knots = {f'rest_curvature_{axis}{knot}': one for knot, pair in enumerate(rest_curvature, start=1)
+             for axis, one in zip('xy', pair, strict=True)}
+    return {'flexibility': flexibility, 'elasticity': elasticity, 'mass': mass, 'damping': damping,
+            'internal_damping': internal_damping, 'friction': 0.0, 'self_collision': ALONE,
+            **parts, **knots, **others}
 
 
-@defined_in(PARTS)
-def turn_clamps(clamped: IndexRows, clamps: Matrix, turns: Matrix) -> int:
-    """Turn clamps with their hands."""
+class SteppedRod:
+    """Internal forces of a DLO that starts straight, step by step, from points that the caller gives."""
 
+    def __init__(self, rest_lengths, physical, time_step, features=None):
+        places = np.concatenate([[0.0], np.cumsum(rest_lengths)])
+        nothing = np.zeros((len(places), 3))
+        start = core.Start(places, places[:, None] * (1.0, 0, 0), nothing, features)
+        self.rope = core.Rope(start, physical, time_step, NO_TABLE, np.zeros(3))
+        self.time_step = time_step
+        self.follow = np.zeros((0, 3))
 
-@defined_in(PARTS)
-def add_frame(frame: FrameState, step: float, right: Vector) -> int:
-    """Add the impulses of the material frame."""
+    @property
+    def state(self):
+        """What determines its steps, see `core.Rope.state`."""
+        return SimpleNamespace(**self.rope.state, held=np.array(self.rope.held, int), follow=self.follow,
+                               step=self.time_step)
 
+    def hold(self, nodes):
+        """Hold exactly these nodes."""
+        self.rope.hold([int(node) for node in nodes])
 
-@defined_in(PARTS)
-def near_pairs(contact: SelfContact, points: Matrix, stretch: float, reach: float) -> int:
-    """Find pairs of segments that are near; return their number."""
-
-
-@defined_in(PARTS)
-def touch(contact: SelfContact, points: Matrix, velocities: Matrix, inverse_masses: Vector, support: Matrix,
-          step: float, last: Vector) -> int:
-    """Let contacts change the velocities; `last` is what `kernels_near.movement` returned after it."""
-
-
-@defined_in(PARTS)
-def rub(friction: SlipState, points: Matrix, step: float) -> int:
-    """Let the strands rub on each other."""
-
-
-NO_TURNS = np.zeros((0, 9))
-
-
-class SteppedRod(Rod):
-    """A rod whose kernel is called step by step."""
-
-    def velocities(self, points, velocities, gravity, held_velocities, turns=NO_TURNS):
+    def velocities(self, points, velocities, gravity, held_velocities, turns=None):
         """Return the (N, 3) [m/s] velocities after a step without contacts."""
-        self.state.follow[:] = held_velocities
-        wanted = np.empty_like(points)
-        pushed = velocities + self.state.step * gravity
-        assert rod_velocities(self.state, points, pushed, wanted)
-        turn_clamps(self.state.frame.clamped, self.state.frame.clamps, turns)
-        return wanted
+        rope, step = self.rope, self.time_step
+        rope.points[:], rope.velocities[:] = points, velocities + step * gravity
+        self.follow = np.asarray(held_velocities)
+        rope.aim(rope.points[rope.held] + step * self.follow, turns)
+        assert rope.predict()
+        return rope.predicted.copy()
 
     def frame_forces(self, points, times=1):
         """Return the (N, 3) [N] forces of the material frame, after so many steps at the same points."""
         for _ in range(times):
-            self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.state.held), 3)))
-        impulses = np.zeros(points.size)
-        if len(self.state.frame.angles):
-            add_frame(self.state.frame, 1.0, impulses)
-        return impulses.reshape(-1, 3)
+            self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.rope.held), 3)))
+        return self.rope.frame_forces()
 
     def turned(self, points, axes):
         """Turn clamps by rotation vectors (3,), given by held node; what they hold stays where it is."""
         pieces = 1 + int(max((np.linalg.norm(axis) for axis in axes.values()), default=0))
-        rotations = np.tile(np.eye(3), (len(self.state.held), 1, 1))
-        for place, node in enumerate(self.state.held):
+        held = self.rope.held
+        rotations = np.tile(np.eye(3), (len(held), 1, 1))
+        for place, node in enumerate(held):
             if node in axes:
                 rotations[place] = Rotation.from_rotvec(np.array(axes[node]) / pieces).as_matrix()
-        still = np.zeros((len(self.state.held), 3))
+        still = np.zeros((len(held), 3))
         for _ in range(pieces):
             self.velocities(points, np.zeros_like(points), np.zeros(3), still, rotations.reshape(-1, 9))
 
 
+class SteppedRope:
+    """A DLO, in the air or on a table, whose steps are those of the compiled engine."""
+
+    def __init__(self, places, points, velocities, physical, time_step, level=NO_TABLE,
+                 gravity=(0.0, 0.0, -GRAVITY)):
+        self._rope = core.Rope(core.Start(places, points, velocities), physical, time_step, level, gravity)
+        self.hold = self._rope.hold
+
+    @property
+    def points(self):
+        """The nodes' positions now, (N, 3) [m]; a copy."""
+        return self._rope.points.copy()
+
+    def advance(self, targets, turns=None):
+        """
+        Take k steps.
+
+        :param targets: (k, h, 3) [m] positions of the held nodes after each step.
+        :param turns: (k, h, 9) rotations of their hands in each step, row by row; None: see `core.Rope.aim`.
+        """
+        for k, target in enumerate(targets):
+            self._rope.aim(target, None if turns is None else turns[k])
+            if not self._rope.step():
+                raise SimulationError('the rollout diverged')
+
+
 class Touching:
-    """Contact of a DLO with itself, of which a kernel is called step by step; see `self_contact`."""
+    """Contact of a DLO with itself, step by step, from points and velocities that the caller gives."""
 
     def __init__(self, places, radius, friction, time_step):
-        self.state = self_contact(np.diff(places), radius, friction)
-        self._step, self._last = time_step, np.zeros(2)
+        self._places, self._step = places, time_step
+        self._physical = {
+            **properties(1.0, 1.0, 1.0), 'self_collision': radius, 'friction': friction}
+        self._thorough = False
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
-        start_distances(self.state, points)
+        start = core.Start(self._places, points, np.zeros_like(points))
+        self.rope = core.Rope(start, self._physical, self._step, NO_TABLE, np.zeros(3))
 
-    def check_every_pair(self, points):
+    def check_every_pair(self):
         """Check every pair of segments in the coming steps, however far apart they are."""
-        self.state.near[0] = near_pairs(self.state, points, 1.2, np.inf)
-        self.state.room[:] = -1.0, -1.0, np.inf
+        self._thorough = True
 
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
-        allowed = velocities.copy()
-        touch(self.state, points, allowed, inverse_masses, support, self._step, self._last)
-        return allowed
+        rope = self.rope
+        rope.points[:], rope.predicted[:], rope.support[:] = points, velocities, support
+        rope.inverse_masses[:] = inverse_masses
+        rope.touch(self._thorough)
+        return rope.predicted.copy()

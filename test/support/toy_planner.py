@@ -48,19 +48,6 @@ class ToyPlan:
         return made_up_plan(start, **{'goal': goal, **self.changes})
 
 
-class NoProcesses:
-    """No process simulates."""
-
-    def prepare(self, simulation, workers):
-        """Do nothing."""
-
-    def ready(self, simulation, workers, should_stop):
-        """Return no executor."""
-
-    def close(self):
-        """Do nothing."""
-
-
 class PlannerGraph(ToyNode):
     """The graph of a planner's session, whose clock stands still unless a test moves it."""
 
@@ -68,8 +55,7 @@ class PlannerGraph(ToyNode):
         super().__init__('planner', INPUT_TYPES, {**OUTPUT_TYPES, 'dlo_description': 'std_msgs/msg/String'})
         self.set = options
         self.decoded = 0
-        self.session = PlannerSession(self, TYPES, lambda _: None, plan=plan, processes=NoProcesses(),
-                                      clock=self.clock)
+        self.session = PlannerSession(self, TYPES, lambda _: None, plan=plan, clock=self.clock)
         self.session.status_period = 0.0
 
     def clock(self):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import signal
+import threading
 import time
 from typing import Mapping, Sequence
 
@@ -17,7 +18,7 @@ from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
 from dlo_calibration.evaluation.evaluator import mean_length
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
-from dlo_calibration.simulation.protocol import Rollout
+from dlo_calibration.simulation.protocol import Job, Rollout, Stop
 
 REACH = 0.2  # m that a parameter moves the points that it moves most, from 0 to 100
 
@@ -38,9 +39,6 @@ class ToySimulator:
         self.fail_below = fail_below
         self.crash = crash
 
-    def prepare(self) -> None:
-        """Need nothing."""
-
     def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
         """Return the goal chains of a trial, analytically."""
         if self.seconds:
@@ -57,6 +55,23 @@ class ToySimulator:
 
     def close(self) -> None:
         """Hold nothing."""
+
+
+class Stoppable(ToySimulator):
+    """Its rollouts last until they are stopped."""
+
+    at_a_time = 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun = threading.Event()
+
+    def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
+        """Wait for the stop."""
+        self.begun.set()
+        while not stop.is_set():
+            time.sleep(0.001)
+        return []
 
 
 class Deadly(ToySimulator):

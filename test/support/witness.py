@@ -37,10 +37,6 @@ class Witness:
         note(self.path, b'S')
         return self.engine.simulate(trial, physical)
 
-    def prepare(self):
-        """Prepare the engine."""
-        self.engine.prepare()
-
     def refined(self):
         """Return the refined engine, which counts, too."""
         finer = self.engine.refined()

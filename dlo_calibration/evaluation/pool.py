@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pool: simulates jobs with one simulator, on threads of this process or on other machines."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+import copy
+from functools import partial
+import math
+import os
+import sys
+import threading
+from typing import Callable, Sequence, TypeVar
+
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.simulation.protocol import (
+    Job,
+    Rollout,
+    simulate_all,
+    Simulator,
+    Stop,
+    TogetherSimulator,
+)
+
+PERIOD = 0.05  # s between two looks whether to stop
+NICE = 5  # by which the priority of threads that simulate is lower: whoever waits for an answer comes first
+
+Outcome = TypeVar('Outcome')
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
+class Threads(ThreadPoolExecutor):
+    """
+    Threads that simulate.
+
+    :param workers: their number; 0: one per core.
+    """
+
+    def __init__(self, workers: int = 0) -> None:
+        #: number of threads
+        self.workers = workers or cores()
+        super().__init__(self.workers, 'simulation', _lower_priority)
+
+    def close(self) -> None:
+        """Drop what waits, and wait for what is under way."""
+        self.shutdown(cancel_futures=True)
+
+
+def _lower_priority() -> None:
+    if sys.platform == 'linux':  # where a thread has a priority of its own
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + NICE, 19))
+
+
+class Pool:
+    """
+    Simulates jobs with one simulator: whoever needs rollouts asks a pool for them.
+
+    Rollouts come in the order of the jobs, and do not depend on the number of workers.
+
+    :param executor: its workers simulate: `Threads`, or a `ClusterExecutor`; None: one thread.
+    :param should_stop: asked often while somebody waits; once it is True, the pool stops.
+    :param memory: has the rollouts that need not be simulated again, and gets the new ones.
+    """
+
+    def __init__(self, simulator: Simulator, executor: Executor | None = None,
+                 should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None) -> None:
+        self.simulator = simulator
+        self._executor = executor or Threads(1)
+        self._should_stop = should_stop
+        self._memory = memory or Memory()
+        self._stop = Stop()
+        self._under_way: set[Future[list[Rollout | SimulationError]]] = set()
+
+    def refined(self) -> Pool | None:
+        """Return a pool with twice the segments and half the time step, which stops with this one."""
+        finer = self.simulator.refined()
+        if finer is None:
+            return None
+        other = copy.copy(self)
+        other.simulator = finer
+        return other
+
+    def stop(self) -> None:
+        """End all rollouts; whoever waits for one gets a CancelledError."""
+        self._stop.set()
+        for one in list(self._under_way):
+            one.cancel()
+
+    def portion(self, jobs: int) -> int:
+        """Return how many of so many jobs one worker should simulate in one call."""
+        most = self.simulator.at_a_time if isinstance(self.simulator, TogetherSimulator) else 1
+        return max(1, min(most, math.ceil(jobs / getattr(self._executor, 'workers', 1))))
+
+    def submit(self, jobs: Sequence[Job],
+               then: Callable[[list[Rollout | SimulationError]], Outcome]) -> Future[Outcome]:
+        """
+        Begin to simulate jobs in one call of a worker; `result` waits for it.
+
+        :param then: makes of the rollouts what the future gives, as soon as they are finished.
+        """
+        outcome: Future[Outcome] = Future()
+        under_way = self._executor.submit(simulate_all, self.simulator, jobs, self._stop)
+        self._under_way.add(under_way)
+        under_way.add_done_callback(partial(self._finish, outcome, then))
+        return outcome
+
+    def _finish(self, outcome: Future[Outcome], then: Callable[[list[Rollout | SimulationError]], Outcome],
+                ended: Future[list[Rollout | SimulationError]]) -> None:
+        self._under_way.discard(ended)
+        try:
+            outcome.set_result(then(ended.result()))
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    def result(self, future: Future[Outcome]) -> Outcome:
+        """
+        Wait for what was submitted.
+
+        :raises CancelledError: when stopped.
+        """
+        while not self._should_stop():
+            try:
+                return future.result(PERIOD)
+            except TimeoutError:
+                if future.done():
+                    return future.result()
+        self.stop()
+        raise CancelledError
+
+    def begin(self, jobs: Sequence[Job]) -> Callable[[], list[Rollout | SimulationError]]:
+        """Begin to simulate jobs, on all workers; return what waits for them, as `simulate` does."""
+        name = self.simulator.name
+        found = [self._memory.rollout(name, job) for job in jobs]
+        new = [k for k, one in enumerate(found) if one is None]
+        size, begun = self.portion(len(new)), []
+        for first in range(0, len(new), size):
+            some = new[first:first + size]
+            asked = [jobs[k] for k in some]
+            begun.append((some, self.submit(asked, partial(self._memory.add_rollouts, name, asked))))
+
+        def ended() -> list[Rollout | SimulationError]:
+            for some, future in begun:
+                rollouts = self.result(future)
+                for k, one in zip(some, rollouts, strict=True):
+                    found[k] = one
+            return [one for one in found if one is not None]
+
+        return ended
+
+    def simulate(self, jobs: Sequence[Job]) -> list[Rollout | SimulationError]:
+        """
+        Return the rollout of each job, or why it failed.
+
+        :raises CancelledError: when stopped.
+        """
+        return self.begin(jobs)()

@@ -1,0 +1,13 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The core, in C++: simulates whole trials, four at a time, without Python's lock.
+
+`roll_out` is its face; `Rope` is for engines that take the steps themselves.  Each physical term is one
+header and one line of `step.hpp`.  `_core.pyi` documents what Python sees.
+"""
+
+from dlo_calibration.simulation.core._core import Event, Grip, roll_out, Rope, Script, Start, Stop, TARGETS
+
+__all__ = ['Event', 'Grip', 'Rope', 'Script', 'Start', 'Stop', 'TARGETS', 'roll_out']

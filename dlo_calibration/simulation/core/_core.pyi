@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What Python sees of the core.  Wrong shapes, indices and numbers that are not finite raise ValueError."""
+
+from typing import Any, Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+#: the kinds of processors whose code this one can execute, the fastest first; all give the same bits
+TARGETS: tuple[str, ...]
+
+class Start:
+    """
+    Where a DLO of N nodes is at the start of a trial.
+
+    :param places: (N,) [m] arc lengths of the nodes at rest, increasing.
+    :param points: (N, 3) [m].
+    :param velocities: (N, 3) [m/s].
+    :param features: (N,) number of markers at each node; None: there are none.
+    :param directions: (N - 1, 3) unit vectors across segments in clamps, nan elsewhere; None: unknown.
+    """
+
+    def __init__(self, places: ArrayLike, points: ArrayLike, velocities: ArrayLike,
+                 features: ArrayLike | None = None, directions: ArrayLike | None = None) -> None: ...
+
+class Grip:
+    """
+    What a hand does while steps are taken; after the last of the k poses, it stays.
+
+    :param rows: of the table of offsets, one for each node that it holds.
+    :param positions: (k, 3) [m] of the hand after each step.
+    :param rotations: (k, 9) of the hand since it closed, matrices row by row; None: it does not turn.
+    :param turns: (k, 9) rotations in each step.
+    """
+
+    def __init__(self, rows: Sequence[int], positions: ArrayLike, rotations: ArrayLike | None,
+                 turns: ArrayLike) -> None: ...
+
+class Event:
+    """Something that happens in a trial."""
+
+    @staticmethod
+    def close(row: int, nodes: Sequence[int], position: ArrayLike) -> Event:
+        """
+        Close a hand at a position (3,) [m].
+
+        Its nodes keep their offsets from it from now on, as rows of a table, from `row` on; no row before may
+        be left out.
+        """
+
+    @staticmethod
+    def hold(nodes: Sequence[int]) -> Event:
+        """Hold exactly these nodes from now on."""
+
+    @staticmethod
+    def advance(grips: Sequence[Grip], count: int, settles: bool = False, remembers: bool = False,
+                sights: Sequence[tuple[int, float]] = ()) -> Event:
+        """
+        Take steps.
+
+        :param grips: what each closed hand does meanwhile, in the order of the held nodes.
+        :param count: number of steps; with `settles`, the most.
+        :param settles: they end as soon as the DLO is stable; if it is, and nothing has happened since, none
+            is taken.
+        :param remembers: the points before are kept, see `see`.
+        :param sights: (steps, share) for each goal meanwhile: it is seen so far (0 to 1) on the way to the
+            points after so many steps, from those before the last of them; before the first step, from those
+            that are remembered.  Those before the last step are remembered.
+        """
+
+    @staticmethod
+    def see(share: float | None = None) -> Event:
+        """
+        See the DLO at the next goal.
+
+        :param share: so far (0 to 1) on the way from the points that are remembered to those now; None: now,
+            and the goal is a stable configuration.
+        """
+
+class Script:
+    """
+    What happens in a trial; it does not depend on the parameters.
+
+    :param stable_distance: the DLO is stable when no node moves as far [m]
+    :param stable_steps: within so many steps, at least 5.
+    """
+
+    def __init__(self, events: Sequence[Event], stable_distance: float, stable_steps: int) -> None: ...
+
+class Stop:
+    """A flag that one thread sets, and that ends `roll_out` in others within some milliseconds."""
+
+    def set(self) -> None: ...
+    def is_set(self) -> bool: ...
+
+def roll_out(jobs: Sequence[tuple[Script, Start, Mapping[str, float], float]], time_step: float,
+             stop: Stop | None = None, target: str = ''
+             ) -> list[tuple[NDArray[np.float64], tuple[bool, ...], int] | None]:
+    """
+    Simulate jobs; any number of threads may call it.  An outcome does not depend on the other jobs.
+
+    :param jobs: script, start, physical parameters by name (SI units), and the height [m] of nodes that touch
+        the table.
+    :param time_step: [s].
+    :param target: one of `TARGETS`; empty: the fastest.
+    :returns: for each job the nodes at the goals (g, N, 3) [m], whether each goal was stable if it had to be,
+        and the number of steps; None where the rollout diverged.  After a stop, outcomes mean nothing.
+    """
+
+class Rope:
+    """
+    A DLO whose steps are taken from Python.
+
+    :param physical: parameters by name (SI units).
+    :param time_step: [s].
+    :param level: height [m] of nodes that touch the table.
+    :param gravity: (3,) [m/s^2].
+    """
+
+    #: (N, 3) [m], [m/s]: state; `predicted`: velocities without contact with others; `support`: how contact
+    #: changed the velocities in the last step.  They share their memory with the rope.
+    points: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    support: NDArray[np.float64]
+    #: (N,) [1/kg] in contact with itself, 0 for held nodes; shared, too
+    inverse_masses: NDArray[np.float64]
+    #: (N,) [kg]
+    masses: NDArray[np.float64]
+    #: the nodes that are held
+    held: list[int]
+    #: (h, 3) [m] where they are after the coming step; a copy
+    targets: NDArray[np.float64]
+    #: copies of what else determines a step, by the names that the headers explain, for tests; `clamps` are
+    #: pairs of a segment and a unit vector (3,) of the material frame there
+    state: dict[str, Any]
+
+    def __init__(self, start: Start, physical: Mapping[str, float], time_step: float, level: float,
+                 gravity: ArrayLike) -> None: ...
+    def hold(self, nodes: Sequence[int]) -> None:
+        """Hold exactly these nodes from now on; a segment between two of them is rigid."""
+
+    def aim(self, targets: ArrayLike, turns: ArrayLike | None = None) -> None:
+        """
+        Set where held nodes are after the coming step.
+
+        :param targets: (h, 3) [m].
+        :param turns: (h, 9) rotations of their hands in that step, row by row; None: a clamp turns with its
+            segment, and not about it.
+        """
+
+    def predict(self) -> bool:
+        """Find `predicted`; tell whether it is finite."""
+
+    def step(self) -> bool:
+        """Take a step on the table; tell whether the rope is still finite."""
+
+    def touch(self, thorough: bool = False) -> None:
+        """
+        Let self-contact change `predicted` as in a step, for tests.
+
+        :param thorough: check every pair of segments, however far apart.
+        """
+
+    def frame_forces(self) -> NDArray[np.float64]:
+        """Return the (N, 3) [N] forces of the material frame at the points of the last step, for tests."""
+
+    def follow(self, script: Script, step: Callable[[], Any]
+               ) -> tuple[NDArray[np.float64], tuple[bool, ...], int] | None:
+        """
+        Follow a script; return its outcome as `roll_out` does.
+
+        :param step: takes a step to the targets that the script has set; it may not hold or aim.
+        """

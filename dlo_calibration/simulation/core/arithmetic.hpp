@@ -1,0 +1,169 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// Arithmetic: the same source computes with doubles and with lanes, for one kind of processor.
+//
+// A function that two kinds of processors shared would be linked once, for either of them.  So all that is
+// compiled for each is in the namespace `DLO_TARGET`.  Where lanes take different branches, both are computed
+// and `select` chooses, inside `if (any(...))`, so that a lone DLO skips what it does not need.  No lane
+// depends on another one: each has the bits that its DLO has alone.
+
+#include <cmath>
+
+#include "numbers.hpp"
+
+namespace dlo {
+namespace DLO_TARGET {
+
+#ifdef DLO_AVX2
+constexpr int kWidth = 4;  // doubles in a register
+#else
+constexpr int kWidth = 2;  // of SSE2 or NEON
+#endif
+constexpr int kParts = kLanes / kWidth;  // registers of a number
+using Vector = double __attribute__((vector_size(8 * kWidth), may_alias));
+using Bits = long long __attribute__((vector_size(8 * kWidth), may_alias));
+
+/// The numbers of four DLOs: plain doubles in memory, which code for every processor may copy.
+struct alignas(32) Lanes {
+  double of[kLanes];
+};
+
+/// The outcome of a comparison, lane by lane.
+struct alignas(32) Mask {
+  long long of[kLanes];
+};
+
+inline Vector& part(Lanes& a, int k) { return reinterpret_cast<Vector*>(a.of)[k]; }
+inline const Vector& part(const Lanes& a, int k) { return reinterpret_cast<const Vector*>(a.of)[k]; }
+inline Bits& part(Mask& a, int k) { return reinterpret_cast<Bits*>(a.of)[k]; }
+inline const Bits& part(const Mask& a, int k) { return reinterpret_cast<const Bits*>(a.of)[k]; }
+
+// The parts one after the other, not in a loop: g++ keeps a number in registers only then.
+#define DLO_PART(number, expression) \
+  if constexpr (number < kParts) { constexpr int k = number; part(result, k) = expression; }
+#define DLO_LANEWISE(Result, expression)                                                    \
+  Result result;                                                                            \
+  DLO_PART(0, expression) DLO_PART(1, expression) DLO_PART(2, expression) DLO_PART(3, expression) \
+  return result
+
+inline Lanes each(double x) { DLO_LANEWISE(Lanes, x - Vector{}); }
+
+#define DLO_OPERATOR(symbol, Result)                                                                \
+  inline Result operator symbol(Lanes a, Lanes b) { DLO_LANEWISE(Result, part(a, k) symbol part(b, k)); } \
+  inline Result operator symbol(Lanes a, double b) { return a symbol each(b); }                     \
+  inline Result operator symbol(double a, Lanes b) { return each(a) symbol b; }
+DLO_OPERATOR(+, Lanes)
+DLO_OPERATOR(-, Lanes)
+DLO_OPERATOR(*, Lanes)
+DLO_OPERATOR(/, Lanes)
+DLO_OPERATOR(<, Mask)
+DLO_OPERATOR(>, Mask)
+#undef DLO_OPERATOR
+inline Lanes operator-(Lanes a) { DLO_LANEWISE(Lanes, -part(a, k)); }
+inline Mask operator&(Mask a, Mask b) { DLO_LANEWISE(Mask, part(a, k) & part(b, k)); }
+
+inline double select(bool choice, double a, double b) { return choice ? a : b; }
+inline Lanes select(Mask choice, Lanes a, Lanes b) {
+  DLO_LANEWISE(Lanes, part(choice, k) ? part(a, k) : part(b, k));
+}
+inline Lanes select(Mask choice, double a, Lanes b) { return select(choice, each(a), b); }
+inline Lanes select(Mask choice, Lanes a, double b) { return select(choice, a, each(b)); }
+inline Lanes select(Mask choice, double a, double b) { return select(choice, each(a), each(b)); }
+
+inline bool any(bool mask) { return mask; }
+inline bool any(Mask mask) {
+  Bits found{};
+  for (int k = 0; k < kParts; ++k) found |= part(mask, k);
+  long long each = 0;
+  for (int k = 0; k < kWidth; ++k) each |= found[k];
+  return each != 0;
+}
+
+// Comparisons with nan are false, so that `min(a, nan)` is a.
+template <class A, class B>
+inline auto min(A a, B b) { return select(b < a, b, a); }
+template <class A, class B>
+inline auto max(A a, B b) { return select(b > a, b, a); }
+
+inline double sqrt(double x) { return __builtin_sqrt(x); }
+inline Vector sqrt(Vector x) {
+  for (int k = 0; k < kWidth; ++k) x[k] = __builtin_sqrt(x[k]);  // one instruction
+  return x;
+}
+inline Lanes sqrt(Lanes a) { DLO_LANEWISE(Lanes, sqrt(part(a, k))); }
+
+template <class Number>
+inline Number abs(Number x) { return select(x < 0.0, -x, x); }
+
+template <class Number>
+inline auto finite(Number x) { return abs(x) < HUGE_VAL; }
+
+// Vectors, with numbers of either kind.
+
+template <class A, class B>
+inline auto operator+(const Vec3<A>& a, const Vec3<B>& b) {
+  return Vec3<decltype(a.x + b.x)>{a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class A, class B>
+inline auto operator-(const Vec3<A>& a, const Vec3<B>& b) {
+  return Vec3<decltype(a.x - b.x)>{a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class A, class B>
+inline auto operator*(A a, const Vec3<B>& b) {
+  return Vec3<decltype(a * b.x)>{a * b.x, a * b.y, a * b.z};
+}
+template <class A, class B>
+inline auto dot(const Vec3<A>& a, const Vec3<B>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class A>
+inline Vec3<A> cross(const Vec3<A>& a, const Vec3<A>& b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+inline Point operator*(const Matrix& m, const Point& p) {
+  return {m[0] * p.x + m[1] * p.y + m[2] * p.z, m[3] * p.x + m[4] * p.y + m[5] * p.z,
+          m[6] * p.x + m[7] * p.y + m[8] * p.z};
+}
+
+// Angles.  Those of the C library differ in their last bit from processor to processor; these, made of sums
+// and products alone, do not.  Errors are below 3e-16 rad or 3e-16 (Taylor series of the reduced argument).
+
+struct Rotation {
+  double cosine, sine;
+};
+
+/// Cosine and sine of an angle [rad] that is below a hundred thousand turns.
+inline Rotation rotation(double angle) {
+  // pi / 2 as a sum; the first part has 33 bits, so that its multiples are exact.
+  constexpr double kQuarter = 1.5707963267341256, kRest = 6.077100506506192e-11;
+  const double quarters = __builtin_nearbyint(angle / kQuarter);
+  if (!(abs(quarters) < 1e15)) return {HUGE_VAL - HUGE_VAL, HUGE_VAL - HUGE_VAL};
+  const double x = (angle - quarters * kQuarter) - quarters * kRest, q = x * x;
+  double cosine = 1.0, sine = 1.0;
+  for (int n = 18; n > 0; n -= 2) cosine = 1.0 - q / (n * (n - 1)) * cosine;
+  for (int n = 19; n > 1; n -= 2) sine = 1.0 - q / (n * (n - 1)) * sine;
+  sine *= x;
+  switch (static_cast<long long>(quarters) & 3) {
+    case 0: return {cosine, sine};
+    case 1: return {-sine, cosine};
+    case 2: return {-cosine, -sine};
+    default: return {sine, -cosine};
+  }
+}
+
+/// The angle [rad] from -pi to pi of a vector; 0 for none.
+inline double angle_of(double y, double x) {
+  constexpr double kQuarter = 1.5707963267948966;
+  const double a = abs(x), b = abs(y);
+  if (!(a + b > 0.0)) return 0.0;
+  // The angle to the nearer axis is halved twice, tan(t / 2) = tan t / (1 + sqrt(1 + tan^2 t)).
+  double t = min(a, b) / max(a, b);
+  for (int k = 0; k < 2; ++k) t = t / (1.0 + sqrt(1.0 + t * t));
+  double sum = 0.0;
+  for (int n = 23; n > 0; n -= 2) sum = 1.0 / n - t * t * sum;
+  double angle = 4.0 * t * sum;
+  if (b > a) angle = kQuarter - angle;
+  if (x < 0.0) angle = 2.0 * kQuarter - angle;
+  return y < 0.0 ? -angle : angle;
+}
+
+}  // namespace DLO_TARGET
+}  // namespace dlo

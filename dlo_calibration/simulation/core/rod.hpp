@@ -1,0 +1,202 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// The mass-spring chain, integrated implicitly, and its contact with a table.
+//
+// Springs of stiffness EA / l join neighbouring point masses.  Each inner node has the bending energy
+// EI / (2 l) |t_i - t_(i-1)|^2, with t the segment vectors divided by their rest lengths (the discrete
+// curvature of Bergou et al., Discrete Elastic Rods, 2008, without twist).  A step is
+//
+//     [M (1 + drag dt) + c K] v' = M v + dt f(x),    x' = x + dt v'
+//
+// With c = dt^2 this is the linearised backward Euler method of Baraff and Witkin, Large Steps in Cloth
+// Simulation, 1998, equation 6.  For one mode of a linear spring, every c >= dt^2 / 2 is stable at any
+// stiffness, and the determinant shows that c damps the mode like a stiffness-proportional damping of c / dt.
+// So c is dt times the internal damping, but at least 0.6 dt^2 for stability (at 0.5 dt^2 the stiffest modes
+// would ring for ever); at this limit the damping depends on the time step.  The negative part of the matrix
+// of a compressed spring is left out, so that the matrix stays positive definite.
+
+#include "rods.hpp"
+
+namespace dlo {
+namespace DLO_TARGET {
+
+constexpr double kHeld = 1e12;  // weight of the equation of a held node, relative to its mass
+
+/// Find the springs of all segments first, batched, so that roots and divisions pipeline.
+template <class Number>
+inline void find_springs(Rods<Number>& rods) {
+  const int segments = rods.nodes - 1;
+  const bool framed = rods.framed;
+  const double step = rods.step;
+  const Number implicit = rods.implicit;
+  const auto *points = rods.points.data();
+  const auto *rest_lengths = rods.rest_lengths.data(), *stiffnesses = rods.stiffness.data();
+  auto* springs = rods.springs.data();
+  auto* tangents = rods.tangents.data();
+  auto* inverse_lengths = rods.inverse_lengths.data();
+  for (int i = 0; i < segments; ++i) {
+    const Vec3<Number> segment = points[i + 1] - points[i];
+    const Number inverse = 1.0 / sqrt(dot(segment, segment)), stiffness = stiffnesses[i];
+    const Number slack = 1.0 - rest_lengths[i] * inverse;
+    const Number across = max(slack, 0.0) * stiffness;
+    springs[i] = {across * implicit, implicit * (stiffness - across) * inverse * inverse,
+                  stiffness * slack * step};
+    if (framed) tangents[i] = inverse * segment, inverse_lengths[i] = inverse;
+  }
+}
+
+template <class Number>
+inline void push_front(std::array<Number, kBand>& last, Number value) {
+  for (int k = kBand - 1; k > 1; --k) last[k] = last[k - 1];
+  last[1] = value;
+}
+
+/// Subtract from a column, and from its right side, the share of the one that lies `Back` before it.
+template <int Back, class Number>
+inline void eliminate(const Column<Number>& done, const std::array<Number, kBand>& last,
+                      Column<Number>& column, Number& value) {
+  const Number share = done[Back] * done[0];
+  for (int m = 0; m + Back < kBand; ++m) column[m] = column[m] - share * done[Back + m];
+  value = value - share * last[Back];
+}
+
+/// Write the equations of a step and solve them by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
+///
+/// `right` has the impulses of other terms, `holding` what lets nodes be held; the solution is written to
+/// `predicted`, and where it is finite to `solved`.  Each column is finished at once from the six before it.
+/// The last one stays in registers, so that nothing that the next pivot waits for comes from memory.
+template <class Number>
+inline void solve(Rods<Number>& rods) {
+  const int n = rods.nodes;
+  const bool framed = rods.framed, strands_rub = rods.strands_rub;
+  const double step = rods.step;
+  const Number drag = rods.drag, implicit = rods.implicit;
+  const auto* points = rods.points.data(), *velocities = rods.velocities.data();
+  const auto* bending = rods.bending.data();
+  const auto* masses = rods.masses.data();
+  const auto* springs = rods.springs.data();
+  const auto* strand_forces = rods.strand_forces.data();
+  const auto* frame_impulses = rods.frame_impulses.data();
+  const auto* holdings = rods.holding.data();
+  const auto* any_held = rods.any_held.data();
+  auto* predicted = rods.predicted.data();
+  Column<Number>* columns = rods.columns.data() + kBand - 1;
+  const Point fall = step * rods.gravity;
+  const Number none{};
+  Number smallest = none + HUGE_VAL;  // pivot
+  Column<Number> done{};              // the last column
+  std::array<Number, kBand> last{};   // last values of the right side, from 1 on
+  const auto next = [&](Number& result, Number value, auto... entries) {
+    Column<Number> column;
+    int count = 0;
+    ((column[count++] = entries), ...);
+    eliminate<6>(columns[-6], last, column, value);
+    eliminate<5>(columns[-5], last, column, value);
+    eliminate<4>(columns[-4], last, column, value);
+    eliminate<3>(columns[-3], last, column, value);
+    eliminate<2>(columns[-2], last, column, value);
+    eliminate<1>(done, last, column, value);
+    smallest = min(smallest, column[0]);
+    column[0] = 1.0 / column[0];
+    push_front(last, value);
+    result = value * column[0];
+    *columns++ = done = column;
+  };
+  Number xx = none, yy = none, zz = none, xy = none, xz = none, yz = none;  // of the segment before
+  Vec3<Number> before{};                                                    // its impulse
+  for (int i = 0; i < n; ++i) {
+    Vec3<Number> force = bending[i][0] * points[i], segment{};
+    if (i + 1 < n) {
+      segment = points[i + 1] - points[i];
+      force = force + bending[i][1] * points[i + 1];
+    }
+    if (i + 2 < n) force = force + bending[i][2] * points[i + 2];
+    if (i > 0) force = force + bending[i - 1][1] * points[i - 1];
+    if (i > 1) force = force + bending[i - 2][2] * points[i - 2];
+    const Number mass = masses[i];
+    Vec3<Number> impulse = mass * (velocities[i] + fall) - step * force;
+    Number diagonal = mass * (1.0 + drag * step) + implicit * bending[i][0];
+    Number first = implicit * bending[i][1], second = implicit * bending[i][2];
+    if (strands_rub) {
+      const StrandForce<Number>& strands = strand_forces[i];
+      diagonal = diagonal + strands.matrix[0];
+      first = first + strands.matrix[1], second = second + strands.matrix[2];
+      impulse = impulse - strands.impulse;
+    }
+    const Number ax = diagonal + xx, ay = diagonal + yy, az = diagonal + zz, bxy = xy, bxz = xz, byz = yz;
+    impulse = impulse - before;
+    const Spring<Number>& spring = springs[i];  // nothing at the last node
+    const auto& [x, y, z] = segment;
+    xx = spring.along * x * x + spring.across, yy = spring.along * y * y + spring.across;
+    zz = spring.along * z * z + spring.across;
+    xy = spring.along * x * y, xz = spring.along * x * z, yz = spring.along * y * z;
+    before = spring.impulse * segment;
+    impulse = impulse + before;
+    Vec3<Number>& result = predicted[i];
+    Number dx = ax + xx, dy = ay + yy, dz = az + zz;
+    if (framed) impulse = impulse + frame_impulses[i];
+    if (any_held[i]) {
+      const Holding<Number>& holding = holdings[i];
+      dx = dx + holding.weight, dy = dy + holding.weight, dz = dz + holding.weight;
+      impulse = impulse + holding.impulse;
+    }
+    next(result.x, impulse.x, dx, bxy + xy, bxz + xz, first - xx, -xy, -xz, second);
+    next(result.y, impulse.y, dy, byz + yz, -xy, first - yy, -yz, none, second);
+    next(result.z, impulse.z, dz, -xz, -yz, first - zz, none, none, second);
+  }
+  Number total = none;
+  last = {};
+  const auto back = [&](Number& result) {
+    --columns;
+    for (int k = kBand - 1; k > 0; --k) result = result - (*columns)[k] * (*columns)[0] * last[k];
+    push_front(last, result);
+    total = total + result;
+  };
+  for (int i = n - 1; i >= 0; --i) back(predicted[i].z), back(predicted[i].y), back(predicted[i].x);
+  rods.solved = select(finite(total) & (smallest > 0.0), none + 1.0, none);
+}
+
+/// Upper bounds [m] of how any two nodes, and any two neighbours, move against each other in a step.
+template <class Number>
+inline std::array<Number, 2> movement(const std::vector<Vec3<Number>>& rows, double step) {
+  const std::size_t n = rows.size();
+  const auto* velocities = rows.data();
+  Number any{}, neighbours{};
+  for (std::size_t i = 0; i < n; ++i) {
+    const auto away = velocities[i] - velocities[n / 2], beside = velocities[i] - velocities[i ? i - 1 : 0];
+    any = max(any, dot(away, away));
+    neighbours = max(neighbours, dot(beside, beside));
+  }
+  return {2 * step * sqrt(any), step * sqrt(neighbours)};
+}
+
+/// Turn `predicted` into the velocities after contact with a table, with Coulomb friction, and take the step.
+/// The constants are Bullet's (PyBullet 3.2.7), found by single steps of a sphere on a plane.
+template <class Number>
+inline void step_on_table(Rods<Number>& rods) {
+  constexpr double kSlop = 1e-5;                        // m of penetration that is allowed
+  const double margin = 0.02 * sqrt(3.0) * 0.005;  // m; further away, a sphere of 5 mm has no contact
+  const double step = rods.step;
+  const Number level = rods.level, friction = rods.friction;
+  const auto* predicted = rods.predicted.data();
+  auto *points = rods.points.data(), *velocities = rods.velocities.data(), *support = rods.support.data();
+  for (int i = 0; i < rods.nodes; ++i) {
+    Vec3<Number> v = predicted[i];
+    const Number distance = points[i].z - level, depth = -(distance + kSlop);
+    const Number wanted = select(depth > 0.0, 0.08 * depth / step, depth / step);  // one step corrects 8 %
+    const Number push = wanted - v.z;
+    const auto touches = (distance < margin) & (push > 0.0);
+    if (any(touches)) {
+      const Number speed = sqrt(v.x * v.x + v.y * v.y);
+      const Number share = select(speed > 0.0, 1.0 - min(1.0, friction * push / speed), 0.0);
+      const Number left = select(touches, share, 1.0);
+      v = {left * v.x, left * v.y, select(touches, wanted, v.z)};
+    }
+    velocities[i] = v;
+    support[i] = v - predicted[i];
+    points[i] = points[i] + step * v;
+  }
+}
+
+}  // namespace DLO_TARGET
+}  // namespace dlo

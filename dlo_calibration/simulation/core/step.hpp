@@ -1,0 +1,103 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// A step: each physical term in its order.
+
+#include "arithmetic.hpp"
+#include "self_contact.hpp"
+#include "rod.hpp"
+#include "strands.hpp"
+#include "frame.hpp"
+
+namespace dlo {
+namespace DLO_TARGET {
+
+/// Call `act` for each held node: with its lane, its index, its velocity and where it is after the step.
+template <class Act>
+inline void each_held(const Ropes& ropes, Act act) {
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
+    const Rope& rope = *ropes[lane];
+    for (std::size_t h = 0; h < rope.held.size(); ++h)
+      act(static_cast<int>(lane), rope.held[h], rope.follow[h], rope.targets[h]);
+  }
+}
+
+/// Let held nodes follow the velocities that their hands give them.
+template <class Number>
+inline void hold(Rods<Number>& rods, const Ropes& ropes) {
+  std::fill(rods.any_held.begin(), rods.any_held.end(), false);
+  each_held(ropes, [&](int lane, int node, const Point& velocity, const Point&) {
+    Holding<Number>& holding = rods.holding[node];
+    if (!rods.any_held[node]) holding = {}, rods.any_held[node] = true;
+    const double weight = kHeld * in_lane(rods.masses[node], lane);
+    in_lane(holding.weight, lane) += weight;
+    set_lane(holding.impulse, lane, in_lane(holding.impulse, lane) + weight * velocity);
+  });
+}
+
+/// Let one DLO not pass through itself in the coming step.
+template <class Number>
+inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
+  std::vector<Point>& points = rope.rods.points;
+  const auto copy = [&](std::vector<Vec3<Number>>& from, std::vector<Point>& to) {
+    if constexpr (lanes_of<Number> > 1)
+      for (int i = 0; i < rods.nodes; ++i) to[i] = in_lane(from[i], lane);
+  };
+  const auto moved = [&](std::array<Number, 2>& by) {
+    return Movement{in_lane(by[0], lane), in_lane(by[1], lane)};
+  };
+  const auto look = [&] { return copy(rods.points, points), points.data(); };
+  if (!is_near(rope.contact, moved(rods.last_moves), moved(rods.next_moves), look)) return;
+  copy(rods.points, points), copy(rods.predicted, rope.rods.predicted), copy(rods.support, rope.rods.support);
+  keep_apart(rope.contact, points.data(), rope.rods.predicted.data(), rods.nodes, rope.inverse_masses.data(),
+             rope.rods.support.data(), rods.step);
+  if constexpr (lanes_of<Number> > 1)
+    for (int i = 0; i < rods.nodes; ++i) set_lane(rods.predicted[i], lane, rope.rods.predicted[i]);
+}
+
+/// Find the velocities due to gravity, internal forces and self-contact, with `targets` and `turns` of each
+/// rope; where that is not finite, `solved` is 0.
+template <class Number>
+void predict(Rods<Number>& rods, const Ropes& ropes) {
+  const double step = rods.step;
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane)
+    for (std::size_t h = 0; h < ropes[lane]->held.size(); ++h) {
+      const Point way = ropes[lane]->targets[h] - in_lane(rods.points[ropes[lane]->held[h]], lane);
+      ropes[lane]->follow[h] = {way.x / step, way.y / step, way.z / step};
+    }
+  constexpr bool kTogether = lanes_of<Number> > 1;  // from their second step on
+  if (rods.strands_rub) {
+    find_strand_forces(rods, kTogether || ropes[0]->strands_begun);
+    ropes[0]->strands_begun = true;
+  }
+  find_springs(rods);
+  if (rods.framed) {
+    add_frame(rods, ropes, kTogether || ropes[0]->frame_begun);
+    ropes[0]->frame_begun = true;
+  }
+  hold(rods, ropes);
+  solve(rods);
+  each_held(ropes, [&](int lane, int node, const Point& velocity, const Point&) {
+    set_lane(rods.predicted[node], lane, velocity);
+  });
+  rods.last_moves = movement(rods.velocities, step);
+  rods.next_moves = movement(rods.predicted, step);
+  for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
+    turn_clamps(*ropes[lane]);
+    if (in_lane(rods.solved, lane) == 1.0) avoid_self_contact(rods, *ropes[lane], lane);
+  }
+}
+
+/// Take a step on a table.
+template <class Number>
+void take_step(Rods<Number>& rods, const Ropes& ropes) {
+  predict(rods, ropes);
+  step_on_table(rods);
+  each_held(ropes, [&](int lane, int node, const Point& velocity, const Point& target) {
+    set_lane(rods.velocities[node], lane, velocity);
+    set_lane(rods.support[node], lane, {0.0, 0.0, 0.0});
+    set_lane(rods.points[node], lane, target);
+  });
+}
+
+}  // namespace DLO_TARGET
+}  // namespace dlo

@@ -1,0 +1,94 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+// Friction between the strands of a cable, which resist bending as an elastic, perfectly plastic element
+// beside the elastic one (Iwan, A Distributed-Element Model for Hysteresis, 1966).
+//
+// Its state is the bend p_i at which it is free of stress, first that of the start: e = t_i - t_(i-1) - p_i
+// causes the moment k EI e / l, and where |e| exceeds l slip, p_i follows.  p_i turns with the DLO by the
+// smallest rotation; the nodes that turn it bear the torque, without which the element would gain energy.
+
+#include "rope.hpp"
+
+namespace dlo {
+namespace DLO_TARGET {
+
+constexpr double kHairpin = 0.01;  // least squared cosine of half an angle between segments: limits divisions
+constexpr double kAhead = 0.6;     // c of friction between strands, relative to the squared step
+
+/// By how much a vector must be multiplied so that it is not longer than `longest`.
+template <class Number>
+inline Number limited(const Vec3<Number>& v, Number longest) {
+  const Number square = dot(v, v);
+  const auto longer = square > longest * longest;
+  Number share = Number{} + 1.0;
+  if (any(longer)) share = select(longer, longest / sqrt(square), share);
+  return share;
+}
+
+/// 1 / square, the squared length of the sum of two unit vectors, which are mostly parallel.
+template <class Number>
+inline Number inverse_of(Number square) {
+  const Number away = 1.0 - square / 4;
+  Number inverse = (1.0 + away * (1.0 + away * (1.0 + away))) / 4;
+  const auto far = away > 1e-4;
+  if (any(far)) inverse = select(far, 1.0 / max(square, 4 * kHairpin), inverse);
+  return inverse;
+}
+
+/// Write to `strand_forces` what friction between strands adds to the equations of the nodes.
+///
+/// The plastic bend turns by the smallest rotation of the mean tangent.  Where the strands are going to slip
+/// in this step, the stiffness is that of the secant: a larger one would brake too much, a smaller one
+/// rattle.
+template <class Number>
+inline void find_strand_forces(Rods<Number>& rods, bool begun) {
+  const int inner = rods.nodes - 2;
+  const auto* points = rods.points.data();
+  const auto* all_strands = rods.strands.data();
+  auto* bends = rods.plastic.data();
+  StrandForce<Number>* forces = rods.strand_forces.data();
+  const double step = rods.step, implicit = kAhead * step * step;
+  for (int i = 0; i < inner; ++i) {  // batched, so that roots and divisions pipeline
+    const Vec3<Number> chord = points[i + 2] - points[i];
+    const Number share = 1.0 / sqrt(dot(chord, chord));
+    forces[i].impulse = share * chord, forces[i].matrix[0] = share;
+  }
+  // What the joints so far add to the next two nodes.
+  const Number none{};
+  Number next = none, beside_next = none, after = none;  // diagonals, and the entry below the first of them
+  Vec3<Number> next_impulse{}, after_impulse{};
+  for (int i = 0; i < inner; ++i) {
+    const Strands<Number> strands = all_strands[i];
+    PlasticBend<Number> plastic = bends[i];
+    const auto& [r0, r1, r2] = strands.row;
+    const Vec3<Number> bend = r0 * points[i] + r1 * points[i + 1] + r2 * points[i + 2];
+    const Vec3<Number> tangent = forces[i].impulse;
+    const Number inverse = forces[i].matrix[0];
+    Vec3<Number> strain{}, coming{};
+    if (begun) {
+      const Number along = 2 * dot(plastic.tangent, plastic.bend);
+      const Vec3<Number> sum = plastic.tangent + tangent;
+      const Number share = dot(sum, plastic.bend) * inverse_of(dot(sum, sum)) * 2;
+      strain = bend - plastic.bend - along * tangent + share * sum;
+      coming = kAhead * (strain - plastic.strain);
+      strain = limited(strain, strands.slip) * strain;
+    }
+    bends[i] = plastic = {bend - strain, tangent, strain};
+    const Number stiffness = strands.stiffness * limited(strain + coming, strands.slip);
+    const Number weight = implicit * stiffness, moment = step * stiffness;
+    strain = moment * strain;
+    // The plastic bend turns with the outer nodes, so that they bear the torque on it.
+    const Number along = inverse * dot(plastic.bend, tangent), share = inverse * dot(strain, tangent);
+    const Vec3<Number> torque = along * strain - share * plastic.bend;
+    forces[i].matrix = {next + weight * r0 * r0, beside_next + weight * r0 * r1, weight * r0 * r2};
+    forces[i].impulse = next_impulse + r0 * strain + torque;
+    next = after + weight * r1 * r1, beside_next = weight * r1 * r2, after = weight * r2 * r2;
+    next_impulse = after_impulse + r1 * strain;
+    after_impulse = r2 * strain - torque;
+  }
+  forces[inner] = {{next, beside_next, none}, next_impulse};
+  forces[inner + 1] = {{after, none, none}, after_impulse};
+}
+
+}  // namespace DLO_TARGET
+}  // namespace dlo

@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A pool: the same rollouts in the same order for any number of threads, and a wait that can be stopped."""
+
+from concurrent.futures import CancelledError
+from contextlib import closing
+import os
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from toy_messages import toy_trials
+from toy_simulator import Stoppable, ToySimulator
+
+from dlo_calibration import EvaluationLog, SimulationError
+from dlo_calibration.evaluation import Memory, Pool, Threads
+from dlo_calibration.model.parameters import ParameterSpace
+
+JOBS = [(toy_trials(1)[0], ParameterSpace().physical({'flexibility': value}, 1.0))
+        for value in (80, 20, 60, 40, 25, 90, 70)]
+
+
+@pytest.mark.parametrize('workers', [1, 2, 3])
+def test_rollouts_come_in_order_and_say_which_failed(workers):
+    itself = ToySimulator(fail_below=30.0)
+    with closing(Threads(workers)) as threads:
+        pool = Pool(itself, threads)
+        for some in (JOBS, JOBS[:1]):
+            found = pool.simulate(some)
+            failed = [k for k, one in enumerate(found) if isinstance(one, SimulationError)]
+            assert failed == ([1, 4] if some is JOBS else [])
+            for one, job in zip(found, some, strict=True):
+                if not isinstance(one, SimulationError):
+                    assert np.array_equal(one.chains, itself.simulate(*job).chains)
+        assert pool.simulate([]) == []
+        with pytest.raises(RuntimeError, match='the toy'):
+            Pool(ToySimulator(crash=True), threads).simulate(JOBS)
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_a_stop_ends_what_is_under_way_and_what_waits(workers):
+    engine, asked = Stoppable(), threading.Event()
+    with closing(Threads(workers)) as threads:
+        pool = Pool(engine, threads, asked.is_set)
+        begun = pool.begin(JOBS)
+        assert engine.begun.wait(60)
+        asked.set()
+        since = time.monotonic()
+        for _ in range(2):
+            with pytest.raises(CancelledError):
+                begun()
+        with pytest.raises(CancelledError):
+            pool.simulate(JOBS)
+        threads.close()
+        assert time.monotonic() - since < 0.2
+
+
+def test_what_was_simulated_before_is_not_simulated_again(tmp_path):
+    once = ToySimulator(fail_below=30.0)
+    with EvaluationLog(tmp_path / 'log') as log:
+        before = Pool(once, memory=Memory(log)).simulate(JOBS[:5])
+        after = Pool(ToySimulator(crash=True), memory=Memory(log)).simulate(JOBS[:5])
+        for one, other in zip(before, after, strict=True):
+            assert str(one) == str(other)
+        with pytest.raises(RuntimeError):
+            Pool(ToySimulator(crash=True), memory=Memory(log)).simulate(JOBS)
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='a thread has no priority of its own')
+def test_threads_that_simulate_come_after_those_that_answer():
+    with closing(Threads(1)) as threads:
+        def own():
+            return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        assert threads.submit(own).result(60) == min(own() + 5, 19)
