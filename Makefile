@@ -206,6 +206,6 @@ $(TESTED): $(STAMP)
 	if ! $(PYTHON) -c 'import pybullet' >/dev/null 2>&1; then
 	  echo 'PyBullet has no binary for this Python: it is compiled now, which takes about four minutes.'
 	  extra bullet ||
-	    echo 'PyBullet is missing, so its tests fail: sudo apt install build-essential adds a compiler.'
+	    echo 'PyBullet is missing, so its tests are skipped: sudo apt install build-essential adds a compiler.'
 	fi
 	touch $@

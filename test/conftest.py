@@ -32,12 +32,28 @@ settings.load_profile('untimed')
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'dlo_calibration'
+#: They compare with PyBullet, or show its window.
+WITH_PYBULLET = ['files/test_samples.py', 'model/test_named_actions.py', *(
+    f'simulation/test_{name}.py' for name in (
+        'bullet', 'compiled', 'engine_contract', 'hysteresis', 'rest_shape', 'window'))]
+collect_ignore = [] if find_spec('pybullet') else WITH_PYBULLET
 FOLDERS = (NAME, 'config', 'launch', 'msg_samples', 'resource')  # of what is installed
+
+
+def pytest_report_header():
+    """Say what is left out where PyBullet cannot be installed."""
+    return [f'PyBullet is not installed; skipped: {", ".join(collect_ignore)}'] if collect_ignore else []
 
 
 def pytest_collection_modifyitems(items):
     """Begin with what takes longest, so that no process is left alone with it at the end."""
     items.sort(key=lambda item: item.name != 'test_mypy_finds_nothing')
+
+
+def pytest_runtest_setup(item):
+    """Skip what needs PyBullet where it cannot be installed."""
+    if item.get_closest_marker('pybullet') and not find_spec('pybullet'):
+        pytest.skip('needs PyBullet')
 
 
 def pytest_collection_finish():

@@ -49,6 +49,7 @@ def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
     assert notices() == []
 
 
+@pytest.mark.pybullet
 def test_bullet_is_one_option_away(notices):
     simulator = make_simulator(Options(engine='bullet'))
     assert type(simulator) is ProcessSimulator
@@ -74,6 +75,7 @@ def test_the_compiled_engine_refuses_a_scene_by_name(scene):
                                   'a table; use engine bullet or auto')
 
 
+@pytest.mark.pybullet
 def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
     for _ in range(2):
         assert make_simulator(Options(scene=scene)).name == 'bullet'
@@ -81,6 +83,7 @@ def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
                          f'compiled does not support a scene: {scene}']
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize('engine', ['auto', 'bullet'])
 def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engine):
     options = Options(engine=engine, scene='nowhere.urdf', workers=1)
@@ -88,6 +91,7 @@ def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engin
         calibrate(toy_trials(1), options, make_simulator=make_simulator)
 
 
+@pytest.mark.pybullet
 def test_a_path_is_relative_to_the_working_directory(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert make_simulator(Options(engine='bullet', scene='box.urdf')).name == 'bullet'

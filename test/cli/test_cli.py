@@ -406,6 +406,7 @@ SCENE = ('<robot name="box"><link name="box"><collision><origin xyz="5 0 0"/><ge
          '<box size="1 1 1"/></geometry></collision></link></robot>')
 
 
+@pytest.mark.pybullet
 def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsys):
     """The scene is found in the session's folder, from anywhere, and named in the report."""
     monkeypatch.chdir(tmp_path)

@@ -169,6 +169,7 @@ def test_many_points_and_any_name(run, request_of, tmp_path, monkeypatch):
     assert not list(tmp_path.glob('*.png'))
 
 
+@pytest.mark.pybullet
 def test_without_a_screen_the_window_is_one_clear_error(run, request_of, monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     code, output, notes = run(RESULT, request_of([PLACE]), '--draws', 0, '--gui')

@@ -48,6 +48,7 @@ def test_every_document_with_snippets_is_tried_here():
     assert found == {'README.md', 'doc/export.md', 'doc/guide.md', 'doc/planning.md'}
 
 
+@pytest.mark.pybullet
 def test_the_snippets_of_the_readme_work(tmp_path, capsys):
     import pybullet
 
@@ -77,6 +78,7 @@ def test_the_snippet_about_actions_works():
     assert [point.transforms[0].translation.z for point in names['action'].points] == [0.004, 0.1]
 
 
+@pytest.mark.pybullet
 def test_the_snippet_about_a_robot_that_holds_a_rope_works():
     import pybullet
 

@@ -120,7 +120,7 @@ def test_sine_and_cosine_are_those_of_the_library(angle):
 @given(st.floats(-1e9, 1e9), st.floats(-1e9, 1e9))
 def test_the_angle_of_a_vector_is_that_of_the_library(y, z):
     # The frame begins along z and turns to -y.
-    expected = math.atan2(-y, z) if y or z else 0.0
+    expected = math.atan2(0.0 - y, z) if y or z else 0.0  # pi, also where y is -0.0
     assert in_clamps((y, z))[1][0] == pytest.approx(expected, rel=4e-16, abs=4e-16)
 
 
