@@ -30,7 +30,7 @@ def _bullet(options: Options) -> Simulator:
 
     content = f'scene {options.scene}' if options.scene else 'trials'
     if find_spec('pybullet') is None:
-        raise NoPyBullet(content if options.scene else 'engine bullet', 'PyBullet is not installed',
+        raise NoPyBullet(content if options.scene else 'engine bullet', 'no PyBullet',
                          'that library', 'install it: pip install pybullet')
     obstacles = read_scene(options.scene) if options.scene else ()
     return ProcessSimulator('bullet', functools.partial(_bullet_here, engine_settings(options), obstacles),

@@ -29,7 +29,7 @@ class Prepared:
     What of a trial does not depend on the parameters.
 
     :param level: height [m] of nodes on the table; None if it is unknown, or if there is no table.
-    :param start: of the nodes, unless their height on the table is unknown.
+    :param start: of the nodes; where their height on the table is unknown, as they were observed.
     """
 
     trial: Trial

@@ -108,7 +108,7 @@ def test_without_pybullet_its_engine_and_scenes_are_refused_in_a_sentence(withou
                            (Options(scene=scene), f'scene {scene}')):
         with pytest.raises(InputError) as refusal:
             calibrate(toy_trials(1), options)
-        assert str(refusal.value) == (f'{thing}: got PyBullet is not installed, expected that library; '
+        assert str(refusal.value) == (f'{thing}: got no PyBullet, expected that library; '
                                       'install it: pip install pybullet')
 
 

@@ -90,7 +90,7 @@ void Rope::hold(const std::vector<int>& nodes) {
   if (nodes == held) return;
   const int n = rods.nodes;
   held = nodes;
-  targets.assign(held.size(), {}), follow.assign(held.size(), {}), turns.clear();
+  targets.assign(held.size(), {}), hand_velocities.assign(held.size(), {}), turns.clear();
   std::vector<bool> follows(n, false), rigid(n - 1);
   inverse_masses.resize(n);
   for (int i = 0; i < n; ++i) inverse_masses[i] = 1 / rods.masses[i];

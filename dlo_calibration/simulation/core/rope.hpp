@@ -11,7 +11,7 @@
 
 namespace dlo {
 
-/// Physical properties of a DLO, in SI units; doc/parameters.md explains them.
+/// Physical properties of a DLO, in SI units; doc/physics.md explains them.
 struct Properties {
   double bending_stiffness = 0.0, stretching_stiffness = 0.0, mass = 0.0;
   double drag = 0.0, internal_damping = 0.0, friction = 0.0, radius = 0.0;
@@ -92,7 +92,7 @@ class Rope {
   Rods<double> rods;
   SelfContact contact;
   std::vector<int> held;
-  std::vector<Point> targets, follow;  // of the held nodes in the coming step: where to [m], how fast [m/s]
+  std::vector<Point> targets, hand_velocities;  // of held nodes in the coming step: where to [m]; [m/s]
   std::vector<Matrix> turns;           // how their hands turn in that step; empty: with the segment
   std::vector<Clamp> clamps;
   std::vector<double> inverse_masses;  // 0 for held nodes

@@ -84,12 +84,12 @@ inline void begin(SelfContact& contact, const Point* points) {
 }
 
 /// The least gap [m] between spheres, each and the one that is `away` further; several gaps at once.
-inline double least_gap(const Spheres& balls, int count, int away) {
+inline double least_gap(const Spheres& spheres, int count, int away) {
   const auto gap = [&](int i, auto load) {
-    const auto x = load(balls.x, i + away) - load(balls.x, i);
-    const auto y = load(balls.y, i + away) - load(balls.y, i);
-    const auto z = load(balls.z, i + away) - load(balls.z, i);
-    return sqrt(x * x + y * y + z * z) - load(balls.radius, i + away) - load(balls.radius, i);
+    const auto x = load(spheres.x, i + away) - load(spheres.x, i);
+    const auto y = load(spheres.y, i + away) - load(spheres.y, i);
+    const auto z = load(spheres.z, i + away) - load(spheres.z, i);
+    return sqrt(x * x + y * y + z * z) - load(spheres.radius, i + away) - load(spheres.radius, i);
   };
   Lanes gaps = each(HUGE_VAL);
   double found = HUGE_VAL;

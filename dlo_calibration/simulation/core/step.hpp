@@ -17,7 +17,7 @@ inline void each_held(const Ropes& ropes, Act act) {
   for (std::size_t lane = 0; lane < ropes.size(); ++lane) {
     const Rope& rope = *ropes[lane];
     for (std::size_t h = 0; h < rope.held.size(); ++h)
-      act(static_cast<int>(lane), rope.held[h], rope.follow[h], rope.targets[h]);
+      act(static_cast<int>(lane), rope.held[h], rope.hand_velocities[h], rope.targets[h]);
   }
 }
 
@@ -62,7 +62,7 @@ void predict(Rods<Number>& rods, const Ropes& ropes) {
   for (std::size_t lane = 0; lane < ropes.size(); ++lane)
     for (std::size_t h = 0; h < ropes[lane]->held.size(); ++h) {
       const Point way = ropes[lane]->targets[h] - in_lane(rods.points[ropes[lane]->held[h]], lane);
-      ropes[lane]->follow[h] = {way.x / step, way.y / step, way.z / step};
+      ropes[lane]->hand_velocities[h] = {way.x / step, way.y / step, way.z / step};
     }
   constexpr bool kTogether = lanes_of<Number> > 1;  // from their second step on
   if (rods.strands_rub) {
