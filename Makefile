@@ -11,7 +11,7 @@ PYTHON := $(VENV)/bin/python
 # Without bytecode, each of the many processes of a test compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 MEASURED := $(wildcard $(or $(DLO_DATA),../shared/data))
-LINT := test/test_lint.py test/test_copyright.py test/test_architecture.py test/test_packaging.py
+LINT := test/test_lint.py test/test_architecture.py test/test_packaging.py
 
 ifeq ($(shell test "$${ROS_DISTRO-}" = jazzy && python3 -c 'import rclpy' 2>/dev/null && echo yes),yes)
 # numpy 2 cannot load message types that were built against numpy 1.

@@ -61,7 +61,7 @@ setup(
     maintainer_email='dlo_calibration@example.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'capture/page/*', 'files/schema/*.xsd', 'report/page.html',
+    package_data={NAME: ['py.typed', 'files/schema/*.xsd', 'page/static/*', 'report/page.html',
                          'simulation/core/*.pyi']},
     data_files=shared_files(),
     cmdclass={'build_ext': Build},
@@ -130,8 +130,8 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'calibrator = {NAME}.ros.calibrator:main',
-            f'planner = {NAME}.ros.planner:main',
+            f'calibrator = {NAME}.ros.executable:calibrator',
+            f'planner = {NAME}.ros.executable:planner',
             f'dlo-calibration = {NAME}.__main__:main',
         ],
     },

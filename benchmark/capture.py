@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'support')
 from photographs import photograph  # noqa: E402
 from rendered_scenes import distances, scene  # noqa: E402
 
-from dlo_calibration.capture.trace import Tracer  # noqa: E402
 from dlo_calibration.errors import InputError  # noqa: E402
+from dlo_calibration.vision.tracer import Tracer  # noqa: E402
 
 FAR = 0.002  # m; a line that is further off should say that it is not sure
 

@@ -54,7 +54,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import DloCalibrationError, InputError
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.messages.codec import (
     ACTION,

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 from scipy.optimize import least_squares
 
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.session import read_session
 from dlo_calibration.model.parameters import BY_NAME, GRAVITY
 from dlo_calibration.search import Hints, LeastSquares, Observation

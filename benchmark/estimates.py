@@ -38,7 +38,7 @@ def rows(name: str, path: Path, truth: dict[str, float]) -> list[str]:
     options, trials = session.options, session.trials
     space = ParameterSpace(free=tuple(truth), mass=options.mass)
     start = time.perf_counter()
-    found = prior_estimates(trials, space, options.table_height if options.table else None)
+    found = prior_estimates(trials, space, options.table_top)
     seconds = time.perf_counter() - start
     table = []
     for key, one in found.items():

@@ -269,8 +269,8 @@ def main() -> None:
     sys.setswitchinterval(0.0005)  # as the node: these threads shall not be what is waited for
     rclpy.init()
     day = Day(chosen.minutes)
-    child = subprocess.Popen([sys.executable, '-m', 'dlo_calibration.ros.calibrator', '--ros-args',
-                              '-p', f'mass:={MASS}', '-p', f'output_directory:={folder}'])
+    child = subprocess.Popen([sys.executable, '-m', 'dlo_calibration.ros.executable', 'calibrator',
+                              '--ros-args', '-p', f'mass:={MASS}', '-p', f'output_directory:={folder}'])
     try:
         figures = day.play()
         begun = day.now

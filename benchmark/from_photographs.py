@@ -39,7 +39,7 @@ import cv2  # noqa: E402
 from discretisation import DATA, exact_trials  # noqa: E402
 from laid_board import LaidBoard  # noqa: E402
 import make_photographs as sample  # noqa: E402
-from photographed_trials import interpreted  # noqa: E402
+from photographed_trials import drafted  # noqa: E402
 from photographs import Camera, Look, photograph  # noqa: E402
 from PIL import Image  # noqa: E402
 from rendered_scenes import clicks, COLOURS  # noqa: E402
@@ -182,13 +182,13 @@ def calibrated(dlo: Manipulated, seed: int, photographs: dict[str, tuple[bytes, 
     """
     begun = os.times().user
     with tempfile.TemporaryDirectory() as folder:
-        read, ids = interpreted(Path(folder) / 'project', photographs, said, {'mass': dlo.mass})
+        read, ids = drafted(Path(folder) / 'project', photographs, said, {'mass': dlo.mass})
     unusable = [str(one.plain['remarks']) for one in read.trials if one.trial is None]
     unusable += [f'{name}: {read.photographs[one].plain["trace_problem"]}' for name, one in ids.items()
                  if read.photographs[one].axis is None]
     if unusable:
         return {'problem': '; '.join(unusable)}
-    trials = tuple(timed(trial, true) for trial, true in zip(read.usable, dlo.trials, strict=True))
+    trials = tuple(timed(trial, true) for trial, true in zip(read.complete, dlo.trials, strict=True))
     seen, true = ([chain for trial in some for chain in (trial.initial, trial.goals[0].chain)]
                   for some in (trials, dlo.trials))
     off = [np.linalg.norm(one.points - points, axis=1)

@@ -35,7 +35,7 @@ from dlo_calibration import Chain, Trial  # noqa: E402
 from dlo_calibration.calibration.calibrate import fitted  # noqa: E402
 from dlo_calibration.calibration.options import Options  # noqa: E402
 from dlo_calibration.calibration.setting import Setting  # noqa: E402
-from dlo_calibration.evaluation.evaluator import Evaluator  # noqa: E402
+from dlo_calibration.evaluation.evaluation import Evaluator  # noqa: E402
 from dlo_calibration.model.parameters import (  # noqa: E402
     BY_NAME,
     PAPER_PARAMETERS,  # noqa: E402

@@ -30,12 +30,11 @@ from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.fit import Fit, fit
 from dlo_calibration.calibration.prior import prior
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, samples, session_trials
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.search import Hints, LeastSquares, SEARCHES
-from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.search.sampling import RandomSearch
 
 RESULTS = Path(__file__).resolve().parent / 'results'
 RUNGS = ((31, 0.004), (21, 0.006), (15, 0.009))  # nodes, time step [s]

@@ -31,11 +31,11 @@ from intervals import FITTED, noisy  # noqa: E402
 from dlo_calibration import read_session, Trial  # noqa: E402
 from dlo_calibration.calibration.calibrate import fitted  # noqa: E402
 from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
-from dlo_calibration.calibration.live_information import LiveInformation  # noqa: E402
 from dlo_calibration.calibration.options import Options  # noqa: E402
 from dlo_calibration.calibration.setting import Setting  # noqa: E402
 from dlo_calibration.inference.trial_information import TrialInformation  # noqa: E402
 from dlo_calibration.model.parameters import SCALE  # noqa: E402
+from dlo_calibration.workspace.live_information import LiveInformation  # noqa: E402
 
 DRAWS = 2  # of the noise of each reference object
 CABLE, RECORDINGS = 'dlo2', '0,8'

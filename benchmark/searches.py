@@ -23,8 +23,8 @@ import numpy as np
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import prior
-from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.files.session import read_session
 from dlo_calibration.search import Observation, SEARCHES
 

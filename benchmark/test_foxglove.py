@@ -13,11 +13,10 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
 
-from dlo_calibration.files.bag import encode
-from dlo_calibration.files.intake import OUTPUT_TYPES
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.messages.codec import bag_types, OUTPUT_TYPES
 from dlo_calibration.ros.diagnostics import status
 
 SAMPLES = Path(__file__).resolve().parent.parent / 'msg_samples'
@@ -77,7 +76,8 @@ def test_foxglove_reads_what_rosbags_reads(foxglove, sample):
 
 def test_foxglove_reads_what_the_node_tells(foxglove, tmp_path):
     kind = OUTPUT_TYPES['status']
-    said = status(bag_types(), stamp=5, state='failed', trials=3, last_refusal='\u00fc', detail='why')
+    content = {'state': 'failed', 'trials': 3, 'last_refusal': '\u00fc', 'detail': 'why'}
+    said = status(bag_types(), 5, content, None)
     with SessionWriter(tmp_path / 'session', {'seed': 3}) as writer:
         for k in range(3):
             writer.write('/calibrator/status', kind, encode(said, kind), k + 1)

@@ -17,9 +17,10 @@ pytest.importorskip('rclpy')
 
 from rclpy.clock import Clock, ClockType  # noqa: E402 - where there is a ROS
 
-from dlo_calibration.cli import conversation  # noqa: E402
+from dlo_calibration.cli import demo_robot  # noqa: E402
 from dlo_calibration.files.session import read_session  # noqa: E402
-from dlo_calibration.ros import calibrator_node  # noqa: E402
+from dlo_calibration.ros.calibrator_node import CalibratorNode  # noqa: E402
+from dlo_calibration.ros.graph_node import spin  # noqa: E402
 from dlo_calibration.signals import StopFlag  # noqa: E402
 
 SAMPLE = Path(__file__).resolve().parent.parent / 'msg_samples' / 'object1'
@@ -28,7 +29,7 @@ PERIOD = 0.02  # s of the node's timer, and between two calls
 CALLS = 500
 
 
-class Watched(calibrator_node.CalibratorNode):
+class Watched(CalibratorNode):
     """The node, with a timer that records the times at which it fires."""
 
     fired: list[float] = []
@@ -41,9 +42,8 @@ class Watched(calibrator_node.CalibratorNode):
 
 def watched_node(file, *args):
     """Run the node until Ctrl-C, then write the times at which the timer fired."""
-    calibrator_node.CalibratorNode = Watched
     with StopFlag() as stop:
-        calibrator_node.spin(args, stop)
+        spin('calibrator', Watched, args, stop)
     np.savetxt(file, Watched.fired)
 
 
@@ -55,9 +55,9 @@ def running_node(folder, **options):
         child = subprocess.Popen([sys.executable, __file__, str(folder / 'fired'), '--ros-args', *words],
                                  stdout=log, stderr=subprocess.STDOUT)
     try:
-        with conversation._robot(child, folder / 'log', lambda: False) as robot:
+        with demo_robot._robot(child, folder / 'log', lambda: False) as robot:
             yield robot
-        child.send_signal(conversation.signal.SIGINT)
+        child.send_signal(demo_robot.signal.SIGINT)
         assert child.wait(60) == 0
     finally:
         child.kill()
@@ -69,7 +69,7 @@ def round_trips(robot):
     from rcl_interfaces.srv import GetParameters
     import rclpy
 
-    client = robot._node.create_client(GetParameters, f'{conversation.NODE}/get_parameters')
+    client = robot._node.create_client(GetParameters, f'{demo_robot.NODE}/get_parameters')
     assert client.wait_for_service(60)
     request, found = GetParameters.Request(names=['evaluations']), []
     for _ in range(CALLS):
@@ -98,7 +98,7 @@ def rows():
 @pytest.mark.parametrize('engine', ['none', 'compiled', 'bullet'])
 def test_the_node_answers_while_it_calibrates(engine, rows, tmp_path, monkeypatch):
     """Measure the node; without a calibration if the engine is `none`."""
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % conversation.LAST_DOMAIN))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % demo_robot.LAST_DOMAIN))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros'))
     with running_node(tmp_path, engine='auto' if engine == 'none' else engine, search='random',

@@ -18,8 +18,8 @@ SLOW = ('numpy', 'scipy', 'scipy.spatial', 'scipy.optimize', 'matplotlib', 'pybu
 COMMANDS = {
     'dlo-calibration --help': ('dlo_calibration', '--help'),
     'dlo-calibration info SESSION': ('dlo_calibration', 'info', str(SAMPLES / 'object1')),
-    'calibrator --help': ('dlo_calibration.ros.calibrator', '--help'),
-    'calibrator, until it is ready': ('dlo_calibration.ros.calibrator',),
+    'calibrator --help': ('dlo_calibration.ros.executable', 'calibrator', '--help'),
+    'calibrator, until it is ready': ('dlo_calibration.ros.executable', 'calibrator'),
 }
 FIT = ('first simulation begins', 'first evaluation kept', 'result printed', 'page and all files written')
 #: executes the command, and notes when its threads get the first evaluation to simulate

@@ -27,10 +27,10 @@ ROUNDS = 3
 EVALUATIONS = 150
 WORKERS = (1, 2)
 MEASURED = {'compiled': 150, 'bullet': 6}  # engine -> evaluations
-STAGES = {'imports': 'interpreter and imports', 'reading': 'session',
+STAGES = {'imports': 'drafter and imports', 'reading': 'session',
           'first': 'until the first evaluation', 'rounds': 'the other evaluations',
           'closing': 'end of the calibration', 'writing': 'report, pictures, files',
-          'end': 'end of the interpreter'}
+          'end': 'end of the drafter'}
 
 
 @pytest.fixture(scope='module')

@@ -14,22 +14,117 @@ Plans that DIR has already are not made again.  The tables are printed, and writ
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
+from dataclasses import dataclass, replace
+import functools
 from pathlib import Path
 import shlex
 import sys
+from typing import Callable, Mapping, TextIO
 
-from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.cli.output import tell
-from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.experiment.known_dlos import KNOWN_DLOS
+from plan_executions import (
+    Belief,
+    CalibrationTask,
+    DEFAULT,
+    execute,
+    learn,
+    Planner,
+    PlanOutcome,
+    PlanTask,
+    TRUE,
+)
+from reality import KNOWN_DLOS, KnownDlo
+import worth_tables
+
+from dlo_calibration.calibration.engines import make_simulator, SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.cli.output import print_message
+from dlo_calibration.errors import DloCalibrationError, InputError
+from dlo_calibration.experiment.journal import performed
 from dlo_calibration.experiment.study import Observed
-from dlo_calibration.experiment.worth_conduct import conduct_worth, WorthStudy
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import read_session
+from dlo_calibration.files.session import read_session, samples
 from dlo_calibration.planning.options import PlanOptions
+from dlo_calibration.planning.planner import plan
 from dlo_calibration.signals import StopFlag
+from dlo_calibration.writing import Attempts, make_folder, whole
 
 NAMES = tuple(dlo.name for dlo in KNOWN_DLOS)
+BELIEFS, PLANS = 'knowledge.jsonl', 'plans.jsonl'  # journals in the folder of the experiment
+
+
+@dataclass(frozen=True)
+class WorthStudy:
+    """
+    What the experiment does.
+
+    :param observed: trials of each object, on which it is calibrated.
+    :param pairs: number of starts and goals of each object, from the random `seed`.
+    :param workers: threads; 0: one per core.
+    :param command: that repeats the experiment.
+    """
+
+    observed: Mapping[KnownDlo, Observed]
+    pairs: int
+    seed: int
+    options: PlanOptions
+    workers: int
+    command: str
+
+    def __post_init__(self) -> None:
+        if self.pairs < 1:
+            raise InputError('--pairs', str(self.pairs), '1 or more', 'correct it')
+
+
+def conduct_worth(study: WorthStudy, folder: Path, make_simulator: SimulatorFactory,
+                  stop: Callable[[], bool], note: Callable[[str], None], stream: TextIO,
+                  planner: Planner = plan) -> tuple[str, Attempts]:
+    """
+    Make the plans that are not in `folder` yet, then write tables and a picture of all.
+
+    :param note: called with each sentence for the user.
+    :param stream: for a progress bar.
+    :returns: the tables, empty if no plan is done; and the files that could not be written.
+    :raises InputError: if `folder` cannot be made, or a journal cannot be read.
+    """
+    make_folder(folder)
+    attempts = Attempts(folder)
+    with closing(make_simulator(Options())) as simulator:
+        engine = simulator.name
+    tasks = _tasks(study, folder, make_simulator, engine, attempts, stop, note, stream)
+    done = performed('plans', tasks, folder / PLANS, PlanOutcome.of,
+                     functools.partial(execute, make_simulator=make_simulator, planner=planner),
+                     study.workers, attempts, stop, note, stream)
+    if not done:
+        return '', attempts
+    wanted = 3 * len(study.observed) * study.pairs
+    text = worth_tables.markdown(done, study.command, engine, len(done) == wanted)
+    for name, content in (('worth.md', text), ('worth.csv', worth_tables.executions_csv(done))):
+        with attempts.attempt(name), whole(folder / name) as new:
+            new.write_text(content, encoding='utf-8')
+    with attempts.attempt('worth.png'):
+        worth_tables.picture(done, folder / 'worth.png')
+    if len(done) < wanted:
+        note(f'interrupted: {len(done)} of {wanted} are done; the same command continues with the others')
+    return text, attempts
+
+
+def _tasks(study: WorthStudy, folder: Path, make_simulator: SimulatorFactory, engine: str,
+           attempts: Attempts, stop: Callable[[], bool], note: Callable[[str], None], stream: TextIO
+           ) -> list[PlanTask]:
+    """Return the first pair of all objects, then the second; calibrate the objects before."""
+    calibrations = [CalibrationTask(dlo, observed, engine) for dlo, observed in study.observed.items()]
+    fitted = performed('calibrations', calibrations, folder / BELIEFS, Belief.of,
+                       functools.partial(learn, make_simulator=make_simulator), study.workers, attempts, stop,
+                       note, stream)
+    certain = replace(study.options, draws=0)  # without doubt, all draws would be the same
+    tasks = []
+    for index in range(study.pairs):
+        for calibration, belief in fitted:
+            dlo = calibration.dlo
+            tasks.append(PlanTask(dlo, belief, index, study.seed, study.options, engine))
+            tasks += [PlanTask(dlo, Belief.certain(kind, dlo), index, study.seed, certain, engine)
+                      for kind in (DEFAULT, TRUE)]
+    return tasks
 
 
 def main() -> int:
@@ -53,7 +148,7 @@ def main() -> int:
     study = WorthStudy(observed, chosen.pairs, chosen.seed, PlanOptions(workers=1), chosen.workers,
                        shlex.join(command))
     with StopFlag() as stop:
-        text, attempts = conduct_worth(study, chosen.output, make_simulator, stop, tell, sys.stderr)
+        text, attempts = conduct_worth(study, chosen.output, make_simulator, stop, print_message, sys.stderr)
     print(text)
     attempts.require()
     return stop.exit_code if stop() else 0

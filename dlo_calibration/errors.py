@@ -38,8 +38,8 @@ def shortened(text: str, most: int = LONGEST) -> str:
     return f'{text[:most - 1 - tail]}…{text[len(text) - tail:]}'
 
 
-def told(text: str, most: int = LONGEST) -> str:
-    """Return a text that is both printable and short."""
+def safe_line(text: str, most: int = LONGEST) -> str:
+    """Return a text as one line that is safe to show and has at most `most` characters."""
     # Twice: escaping megabytes would take long, and makes a text longer.
     return shortened(printable(shortened(text, 2 * most)), most)
 
@@ -55,29 +55,30 @@ class DloCalibrationError(Exception):
     """Base of every error that this package raises on purpose; its text has at most 300 characters."""
 
     def __str__(self) -> str:
-        return told(super().__str__())
+        return safe_line(super().__str__())
 
 
 class InputError(DloCalibrationError):
     """
     An input that cannot be used.
 
-    The message always answers the same four questions, so that its reader can act
-    without opening the code.  Each answer is printable, and shortened if all together are too long.
+    The message, ``thing: came; expected ...; remedy``, always answers the same four questions, so that its
+    reader can act without opening the code.  Each answer is printable, and shortened if all together are too
+    long.
 
     :param thing: which input, e.g. ``goal_chain stamped 12.5 s``.
-    :param came: what was found in it.
+    :param came: what is wrong with it: a noun, e.g. ``two hands that grip point 3``, or a statement.
     :param expected: what would have been accepted.
     :param remedy: what the user can do.
     """
 
     def __init__(self, thing: str, came: str, expected: str, remedy: str) -> None:
         self.thing, self.came, self.expected, self.remedy = parts = tuple(
-            map(told, (thing, came, expected, remedy)))
+            map(safe_line, (thing, came, expected, remedy)))
         super().__init__(*parts)
 
     def __str__(self) -> str:
-        form = '{}: got {}, expected {}; {}'
+        form = '{}: {}; expected {}; {}'
         most = LONGEST - len(form.format(*[''] * 4))
         # A user copies the name of the thing, and follows the remedy: these stay whole as long as possible.
         thing, remedy = _fitting((self.thing, self.remedy), most - 100)
@@ -89,6 +90,12 @@ class SimulationError(DloCalibrationError):
     """A trial that an engine cannot simulate, or a rollout that diverged."""
 
 
+def one_line(error: BaseException) -> str:
+    """Return an error's text as one line, which begins with the type of an error that is not ours."""
+    kind = '' if isinstance(error, DloCalibrationError) else type(error).__name__
+    return ' '.join(': '.join(filter(None, (kind, str(error)))).split())
+
+
 def _fitting(parts: Sequence[str], most: int) -> list[str]:
     """Return texts with at most `most` characters together; the longest ones are shortened."""
     limit = max(map(len, parts))
@@ -98,7 +105,7 @@ def _fitting(parts: Sequence[str], most: int) -> list[str]:
 
 
 def one_of(known: Iterable[str], name: str) -> str:
-    """Say that one of the known names was expected: all of them, or the nearest ones if there are many."""
+    """Say which names are expected: all that are known, or the most similar ones if there are many."""
     known = list(known)
     if len(known) <= 8:  # they fit into an error
         return f'one of {", ".join(known)}'
@@ -106,8 +113,8 @@ def one_of(known: Iterable[str], name: str) -> str:
     return f'one of {", ".join(near)} or {len(known) - len(near)} others'
 
 
-def meant(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the remedy for an unknown name: the known one that was probably meant; else `otherwise`."""
+def suggestion(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return the remedy for an unknown name: the most similar known one; if none is similar, `otherwise`."""
     plain = {_plain(one): one for one in known}
     near = get_close_matches(_plain(shortened(name, 100)), plain, n=1)
     return f'did you mean {plain[near[0]]}?' if near else otherwise
@@ -120,4 +127,4 @@ def _plain(name: str) -> str:
 def unwritable(path: object, error: OSError, kind: str = 'file') -> InputError:
     """Return the error for a file, or another `kind` of path, that cannot be written."""
     return InputError(f'{kind} {path}', error.strerror or str(error), 'a place that can be written to',
-                      'choose another one with --output')
+                      'choose another place')

@@ -14,17 +14,11 @@ import os
 import signal
 import threading
 from types import FrameType
-from typing import Any, Callable
+from typing import Any
+
+from dlo_calibration.writing import remove_unfinished
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from Ctrl-C; from `kill` and `ros2 launch`
-
-
-_cleaners: list[Callable[[], None]] = []
-
-
-def before_end(cleaner: Callable[[], None]) -> None:
-    """Have something called before a signal ends the process."""
-    _cleaners.append(cleaner)
 
 
 def end_at_signals(program: str) -> None:
@@ -36,8 +30,7 @@ def end_at_signals(program: str) -> None:
     def end(number: int, frame: FrameType | None) -> None:
         for other in SIGNALS:
             signal.signal(other, signal.SIG_IGN)  # a second one would end it again, with a second line
-        for one in _cleaners:
-            one()
+        remove_unfinished()
         try:
             os.write(2, f'{program}: interrupted\n'.encode())  # sys.stderr may be in use at this moment
         except OSError:
@@ -62,7 +55,7 @@ class StopFlag:
         self._before: dict[signal.Signals, Any] = {}
 
     def __call__(self) -> bool:
-        """Tell whether a signal has arrived."""
+        """Return whether a signal has arrived."""
         return self._number > 0
 
     @property

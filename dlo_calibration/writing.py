@@ -7,25 +7,29 @@ from __future__ import annotations
 
 from contextlib import contextmanager, suppress
 import errno
+import fcntl
 import os
 from pathlib import Path
+import shutil
 import stat
+import tempfile
 from typing import Iterator
 
 from dlo_calibration.errors import DloCalibrationError, InputError, unwritable
-from dlo_calibration.signals import before_end
+
+SCRATCH = '.dlo_calibration_scratch_'  # begins the names of temporary folders, and of nothing else
 
 _unfinished: set[Path] = set()  # files that are being written
+_scratch: set[Path] = set()  # temporary folders in use
 
 
 def remove_unfinished() -> None:
-    """Remove the files that are being written; for a process that ends now."""
+    """Remove the files that are being written, and temporary folders; for a process that ends now."""
     for path in list(_unfinished):
         with suppress(OSError):
             os.unlink(path)
-
-
-before_end(remove_unfinished)
+    for path in list(_scratch):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager
@@ -39,6 +43,48 @@ def _temporary(folder: Path, suffix: str = '') -> Iterator[Path]:
         with suppress(OSError):
             os.unlink(path)
         _unfinished.discard(path)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """
+    Give a temporary folder, and remove it when the block ends or a signal ends the process.
+
+    A process that is killed leaves its folder.  The next one to need such a folder removes it: the lock on
+    the folder has gone with the process that held it.
+    """
+    for left in Path(tempfile.gettempdir()).glob(f'{SCRATCH}*'):
+        with suppress(OSError), _locked(left, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            shutil.rmtree(left)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=SCRATCH))
+        with _locked(folder, fcntl.LOCK_EX):
+            if not folder.exists():  # removed by another process before it was locked
+                continue
+            _scratch.add(folder)
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+                _scratch.discard(folder)
+            return
+
+
+@contextmanager
+def _locked(folder: Path, how: int) -> Iterator[None]:
+    """
+    Lock a folder of this user; `how` as for `fcntl.flock`.
+
+    :raises OSError: where it cannot be locked, is no folder, or belongs to another user.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        if os.fstat(descriptor).st_uid != os.geteuid():
+            raise PermissionError(errno.EPERM, 'the folder belongs to another user')
+        fcntl.flock(descriptor, how)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager
@@ -58,7 +104,7 @@ def replacing(path: Path, fsync: bool = True) -> Iterator[Path]:
             raise OSError(errno.EEXIST, 'something that is no file has this name')
     with _temporary(path.parent, path.suffix) as new:
         yield new
-        if fsync:  # some file systems tell only now that they are full
+        if fsync:  # some file systems report only now that they are full
             descriptor = os.open(new, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
@@ -81,11 +127,21 @@ def whole(path: Path) -> Iterator[Path]:
         raise unwritable(path, error) from error
 
 
+def write_file(path: str | Path, content: str | bytes) -> None:
+    """
+    Write a file, a text in UTF-8.
+
+    :raises InputError: if it cannot be written.
+    """
+    with whole(Path(path)) as new:
+        new.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def make_folder(folder: Path) -> None:
     """
     Make a folder, with its parents, and check that a file can be written there.
 
-    :raises InputError: where that is not possible.
+    :raises InputError: if that is not possible.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +149,7 @@ def make_folder(folder: Path) -> None:
             new.write_bytes(b'?')  # a full disk may still make a file without content
     except FileExistsError as error:
         raise InputError(f'folder {folder}', 'a file of this name', 'a folder, or a name that is free',
-                         'choose another one with --output') from error
+                         'choose another place') from error
     except OSError as error:
         raise unwritable(folder, error, 'folder') from error
 

@@ -32,7 +32,7 @@ from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.evaluation import Pool
 from dlo_calibration.files.result import read_description
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.planning.rehearsal import Job, rehearse, Step
+from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, rehearse
 
 NODES, SEEN = 81, 4  # of the simulated rope; the tracker gives every fourth one
 NOISE = 0.001  # m, of the tracker
@@ -78,11 +78,11 @@ class SimulatedRobot:
             path = np.array([(one.x, one.y, one.z) for one in places])
             grip = int(np.linalg.norm(self.points - path[0], axis=1).argmin())
             hands.append(Hand(name, (grip,), np.array(times), path))
-        self.steps.append(Step(Action(tuple(hands))))
+        self.steps.append(ActionStep(Action(tuple(hands))))
         # From the very start each time, as a chain alone does not tell how much the rope is stretched.
         found, = rehearse(self.pool, [
-            Job(self.start, tuple(self.steps), self.physical, courses=True)])
-        course = (*found.courses[-1], found.chains[-1])
+            RehearsalJob(self.start, tuple(self.steps), self.physical, trajectories=True)])
+        course = (*found.trajectories[-1], found.chains[-1])
         for self.points in course:
             self.rest(times[-1] / self.pace / len(course))
 

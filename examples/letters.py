@@ -28,21 +28,21 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import lsq_linear
 
-from dlo_calibration import calibrate, Chain, Options, plan, PlanOptions, read_session
-from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.evaluation import Pool
-from dlo_calibration.experiment.known_dlos import KNOWN_DLOS, KnownDlo
-from dlo_calibration.experiment.pairs import POINTS, seen
-from dlo_calibration.experiment.reality import Reality
-from dlo_calibration.experiment.worth import NOISE
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import session_trials
-from dlo_calibration.model.action import Action
-from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import GRAVITY
-from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
-from dlo_calibration.planning.rehearsal import Job, rehearse
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmark'))
+
+from plan_executions import NOISE  # noqa: E402
+from reality import KNOWN_DLOS, KnownDlo, POINTS, Reality, seen  # noqa: E402
+
+from dlo_calibration import calibrate, Chain, Options, plan, PlanOptions, read_session  # noqa: E402
+from dlo_calibration.calibration.engines import make_simulator  # noqa: E402
+from dlo_calibration.calibration.result import CalibrationResult  # noqa: E402
+from dlo_calibration.evaluation import Pool  # noqa: E402
+from dlo_calibration.files.session import samples, session_trials  # noqa: E402
+from dlo_calibration.model.action import Action  # noqa: E402
+from dlo_calibration.model.chain import Floats  # noqa: E402
+from dlo_calibration.model.parameters import GRAVITY  # noqa: E402
+from dlo_calibration.planning.dlo import CalibratedDlo, Posterior  # noqa: E402
+from dlo_calibration.planning.rehearsal import RehearsalJob, rehearse  # noqa: E402
 
 SAFETY = 0.9  # share of the friction that a held letter needs
 NODES, STEPS = 41, 12  # of a held letter; of its fit
@@ -176,9 +176,10 @@ def laid(letter: str) -> Laid:
             left = error(reality.points, goal, dlo)
             sys.stdout.write(f'{letter}, action {k + 1}: {left:.2f} % of the length from the goal\n')
             sys.stdout.flush()
-        laid, = rehearse(Pool(simulator), [Job(Chain(start), reality.steps, dlo.physical, courses=True)])
+        job = RehearsalJob(Chain(start), reality.steps, dlo.physical, trajectories=True)
+        laid, = rehearse(Pool(simulator), [job])
     return Laid(letter, dlo, goal, np.stack(chains), tuple(error(one, goal, dlo) for one in chains),
-                tuple(actions), laid.courses)
+                tuple(actions), laid.trajectories)
 
 
 def error(points: Floats, goal: Floats, dlo: KnownDlo) -> float:

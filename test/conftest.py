@@ -14,14 +14,14 @@ import shutil
 import subprocess
 import sys
 
-from domain import ros_graph, WORKER
-from drawings import leave_out_drawings, leave_out_slices
 from hypothesis import settings
 import pytest
 from random_examples import USUAL
-from serial import serial
+from ros_domain import ros_graph, WORKER
+from toy_command import one_worker
 from toy_simulator import ToySimulator
 from wire import SOURCES
+from without_drawings import leave_out_drawings, leave_out_slices
 
 from dlo_calibration.cli import main as cli
 
@@ -155,7 +155,7 @@ def command(capsys):
     def act(*words):
         capsys.readouterr()
         try:
-            code = cli.main(serial(words), lambda _: ToySimulator())
+            code = cli.main(one_worker(words), lambda _: ToySimulator())
         except SystemExit as end:  # argparse
             code = end.code
         output, errors = capsys.readouterr()

@@ -4,10 +4,13 @@
 """Imports run one way, and heavy libraries stay where they belong."""
 
 import ast
+from collections import defaultdict
 import functools
+from graphlib import CycleError, TopologicalSorter
 import importlib
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -17,23 +20,24 @@ PACKAGE = 'dlo_calibration'
 FOLDER = Path(__file__).resolve().parents[1] / PACKAGE
 
 #: The rooms of the house, in the order in which data flows: a room imports only from those before it.
-ROOMS = ('model', 'observation', 'simulation', 'evaluation', 'search', 'inference', 'calibration', 'planning',
-         'messages', 'files', 'capture', 'export', 'report', 'experiment', 'ros', 'cli')
+ROOMS = ('model', 'observation', 'vision', 'simulation', 'evaluation', 'search', 'inference', 'calibration',
+         'planning', 'messages', 'files', 'export', 'report', 'workspace', 'capture', 'page', 'experiment',
+         'ros', 'cli')
 #: Modules outside the rooms, which every room may import.
-SHARED = ('errors', 'signals', 'writing')
+SHARED = ('errors', 'reading', 'signals', 'writing')
 
 #: Where in the package something may be imported, be it at the top of a module or inside a function.
 ONLY = {
-    'aiohttp': ('capture/events.py', 'capture/guard.py', 'capture/server.py'),
-    'rclpy': ('ros', 'cli/conversation.py'),  # which stands for the robot, on the other side of the graph
-    'pybullet': ('simulation/bullet_world.py', 'simulation/window.py'),
-    'cv2': ('capture',),
-    'PIL': ('capture', 'report/animation.py'),
-    'cma': ('search/cma_es.py',),
+    'aiohttp': ('page',),
+    'rclpy': ('ros', 'cli/demo_robot.py'),  # which stands for the robot, on the other side of the graph
+    'pybullet': ('simulation/bullet.py', 'simulation/window.py'),
+    'cv2': ('vision',),
+    'PIL': ('report/animation.py', 'vision'),
+    'cma': ('search/sampling.py',),
     'lxml': ('files/xml.py',),
     'distributed': ('evaluation/cluster.py',),
     'dlo_calibration.simulation.bullet': ('__init__.py', 'calibration/engines.py', 'simulation/window.py'),
-    'dlo_calibration.simulation.compiled': ('calibration/engines.py',),
+    'dlo_calibration.simulation.compiled': ('calibration/engines.py', 'simulation/bullet.py'),
 }
 
 NOT_LOADED = ('aiohttp', 'cv2', 'PIL', 'jinja2', 'rclpy', 'pybullet', 'distributed', 'matplotlib',
@@ -45,6 +49,11 @@ FILES = sorted(FOLDER.rglob('*.py'))
 def room(file: Path) -> str:
     """Name the room that a file is in; nothing for one outside the rooms."""
     return file.relative_to(FOLDER).parts[0] if file.parent != FOLDER else ''
+
+
+def module_name(file: Path) -> str:
+    """Return the full name of the module in a file."""
+    return '.'.join(file.relative_to(FOLDER.parent).with_suffix('').parts).removesuffix('.__init__')
 
 
 @functools.cache
@@ -80,9 +89,27 @@ def test_every_room_says_what_it_is_and_what_it_offers(folder):
     assert hasattr(offered, '__all__') or folder in ('report', 'ros', 'cli'), 'list what it offers'
 
 
-def test_no_module_is_too_long_to_read():
-    lines = {file.name: file.read_text(encoding='utf-8').count('\n') for file in FILES}
-    assert {name: count for name, count in lines.items() if count > 400} == {}
+def test_no_two_classes_have_the_same_name():
+    places = defaultdict(list)
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(file.relative_to(FOLDER).as_posix())
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Imports inside functions and those for type checking count, too."""
+    imports = {module_name(file): imported(file) for file in FILES}
+    graph = {}
+    for importer, names in imports.items():
+        modules = names & set(imports)
+        packages = {name.rpartition('.')[0] for name in modules}  # of which one of the modules is imported
+        graph[importer] = modules - packages
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f'imports form a circle: {" <- ".join(error.args[1])}')
 
 
 def test_only_these_modules_stand_outside_the_rooms():
@@ -104,6 +131,12 @@ def test_only_its_owner_imports(name):
     assert strangers == set()
 
 
+def test_vision_needs_only_the_chain_of_the_other_rooms():
+    for file in (FOLDER / 'vision').glob('*.py'):
+        others = {name for name in imported(file) if rooms_of(frozenset({name})) - {'vision'}}
+        assert {name for name in others if not name.startswith(f'{PACKAGE}.model.chain')} == set()
+
+
 def test_a_search_never_sees_a_trial():
     for file in (FOLDER / 'search').glob('*.py'):
         assert f'{PACKAGE}.model.trial' not in imported(file)
@@ -117,6 +150,16 @@ LOADED = (
     ((['fit', 'msg_samples/object1', *'--workers 2 --calibrate friction --evaluations 4'.split()],),
      set()),
 )
+
+
+def test_type_checkers_see_the_names_that_programs_can_import():
+    package = importlib.import_module(PACKAGE)
+    block, _ = (node for node in ast.parse((FOLDER / '__init__.py').read_text(encoding='utf-8')).body
+                if isinstance(node, ast.If))
+    seen = {alias.asname: getattr(importlib.import_module(line.module), alias.name)
+            for line in block.body for alias in line.names}
+    assert sorted(seen) == sorted(package.__all__)
+    assert all(getattr(package, name) is value for name, value in seen.items())
 
 
 def test_importing_the_package_loads_no_heavy_library():
@@ -162,3 +205,9 @@ print(*sys.modules)
                           capture_output=True, text=True)
     loaded = set(done.stdout.split())
     assert loaded & SLOW == set()
+
+
+def test_the_index_of_the_support_modules_lists_each_once():
+    folder = Path(__file__).with_name('support')
+    listed = re.findall(r'^\| `(\w+)` \|', (folder / 'README.md').read_text(encoding='utf-8'), re.MULTILINE)
+    assert sorted(listed) == sorted(path.stem for path in folder.glob('*.py'))

@@ -105,7 +105,7 @@ def test_requirements_are_those_of_setup():
         assert f"'{name}>={bound}'" in requirements
 
 
-def test_a_library_that_rosdep_does_not_install_is_told_in_one_line():
+def test_a_missing_optional_library_gives_one_line():
     done = subprocess.run(
         [sys.executable, '-c', "import sys; sys.modules['mcap'] = None\n"
          'from dlo_calibration.__main__ import main; sys.exit(main())',
@@ -204,3 +204,9 @@ def test_a_wheel_from_a_source_distribution_has_all_that_is_used(sources, buildi
     assert not any(name.startswith('test') for name in names)
     wheel.extractall(tmp_path / 'all')
     assert loaded(tmp_path / 'all', tmp_path).is_relative_to(tmp_path / 'all')
+
+
+def test_licence_is_the_one_that_each_file_names():
+    first, second = (ROOT / 'LICENSE').read_text(encoding='utf-8').split('\n')[1:3]
+    assert first.strip() == 'Apache License'
+    assert second.strip() == 'Version 2.0, January 2004'

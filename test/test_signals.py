@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 
 PATIENCE = 60.0  # s
 
@@ -76,7 +76,7 @@ def test_a_second_signal_while_the_first_one_ends_it_adds_no_line():
 
 
 @pytest.mark.parametrize('words', [(), ('--json',)])
-def test_a_full_standard_output_is_told_in_one_line(words):
+def test_a_full_standard_output_gives_one_line(words):
     with open('/dev/full', 'w') as full:
         done = subprocess.run(
             [sys.executable, '-m', 'dlo_calibration', 'info', samples() / 'object1', *words],

@@ -7,12 +7,15 @@ import errno
 import os
 from pathlib import Path
 import resource
+import signal
 import stat
+import subprocess
+import sys
 
 import pytest
 
 from dlo_calibration.errors import DloCalibrationError, InputError
-from dlo_calibration.writing import Attempts, make_folder, remove_unfinished, whole
+from dlo_calibration.writing import Attempts, make_folder, remove_unfinished, scratch_folder, whole
 
 FULL = os.strerror(errno.ENOSPC)
 
@@ -65,7 +68,7 @@ def test_a_link_is_replaced_and_not_followed(tmp_path, there):
 
 
 @pytest.mark.parametrize('make', [os.mkfifo, os.mkdir])
-def test_what_is_no_file_is_refused_at_once(tmp_path, make):
+def test_a_path_that_is_no_file_is_refused_at_once(tmp_path, make):
     make(tmp_path / 'one.txt')
     with pytest.raises(InputError, match='one.txt'):
         with whole(tmp_path / 'one.txt') as new:
@@ -118,3 +121,38 @@ def test_one_file_that_fails_does_not_prevent_the_next_and_is_named(tmp_path):
     assert f'b.txt: {FULL}' in text
     assert 'a.txt, c.txt could be' in text
     assert str(tmp_path) in text
+
+
+#: Unpacks a compressed recording for ever.
+UNPACKING = """
+import sys, time
+from dlo_calibration.__main__ import main
+from dlo_calibration.files import bag_reader
+
+def unpack_file(_, target, *__):
+    target.write_bytes(bytes(1000))
+    print('unpacking', flush=True)
+    time.sleep(60)
+
+bag_reader.unpack_file = unpack_file
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_command_that_ends_while_it_unpacks_leaves_no_folder_for_long(number, tmp_path, monkeypatch):
+    session, temporary = tmp_path / 'session.mcap.zstd', tmp_path / 'tmp'
+    session.write_bytes(b'compressed')
+    temporary.mkdir()
+    environment = {**os.environ, 'TMPDIR': str(temporary)}
+    with subprocess.Popen([sys.executable, '-c', UNPACKING, 'info', str(session)], text=True, env=environment,
+                          stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        assert process.stdout.readline() == 'unpacking\n'
+        process.send_signal(number)
+    assert len(list(temporary.iterdir())) == (number == signal.SIGKILL)
+    monkeypatch.setattr('tempfile.tempdir', str(temporary))
+    with scratch_folder() as folder:
+        assert list(temporary.iterdir()) == [folder]  # not that of the killed process
+        with scratch_folder() as other:
+            assert sorted(temporary.iterdir()) == sorted([folder, other])  # both are in use
+    assert list(temporary.iterdir()) == []

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From trials to a parameter set: `calibrate.calibrate`, its stages, options, engines and result."""
+"""From trials to a parameter set: `calibrate`, its stages, options, engines and result."""
 
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
-from dlo_calibration.calibration.worker import Worker
 
-__all__ = ['CalibrationResult', 'Options', 'ParameterEstimate', 'Worker', 'make_simulator']
+__all__ = ['CalibrationResult', 'Options', 'ParameterEstimate', 'make_simulator']

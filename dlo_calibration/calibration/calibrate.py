@@ -11,23 +11,26 @@ from dataclasses import replace
 import time
 from typing import Callable, Sequence
 
-from dlo_calibration.calibration.automatic import budget, choose
+from dlo_calibration.calibration.choice import budget
+from dlo_calibration.calibration.engines import engine_digest, SimulatorFactory
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
-from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.fit import Fit, fit
-from dlo_calibration.calibration.identity import engine_digest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.prior import Prior, prior
 from dlo_calibration.calibration.refinement import refine
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.calibration.stages import advised, confirming, second_engine, with_missing_parameters
-from dlo_calibration.calibration.surroundings import examined
+from dlo_calibration.calibration.stages import (
+    advised,
+    confirming,
+    examined,
+    second_engine,
+    with_missing_parameters,
+)
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.cluster import ClusterExecutor
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.log import EvaluationLog
-from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Threads
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.observation.plausibility import implausible_trials
@@ -44,18 +47,18 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
     """
     Find the parameter set whose simulation fits the trials best, and how certain each parameter is.
 
-    The code below names the stages in their order. The same trials, options and seed give the same result,
-    bit for bit, for any number of threads. The node and the command line call this function, too.
+    The body of this function lists the stages in their order. The same trials, options and seed give the same
+    result, bit for bit, for any number of threads. Node, command line and page call this function, too.
 
     :param options: see `Options`; None: the defaults.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
-    :param on_notice: called immediately, from any thread, with a sentence about a failure that did not end
-        the calibration, such as a machine that was lost; `CalibrationResult.warnings` contains it, too.
-    :param should_stop: asked often; once True, every stage ends, and the result is the best so far.
+    :param on_notice: called at once, from any thread, with a warning about a failure that does not end the
+        calibration, such as a lost machine; `CalibrationResult.warnings` contains it, too.
+    :param should_stop: polled; once it returns True, every stage ends, and the result is the best so far.
     :param make_simulator: makes the engine that `options` name; called in this thread.
-    :param log: each finished evaluation is written to it, and none in it is simulated again: after an
+    :param log: receives each finished evaluation, and answers those that it holds already: after an
         interruption, even by `kill -9`, the same call gives the same result, except for its `seconds`. None:
-        nothing is kept.
+        nothing is logged.
     :param clock: the time [s], for `CalibrationResult.seconds`.
     :raises InputError: if there is no trial, or an option cannot be satisfied.
     :raises SimulationError: if no evaluation could be simulated.
@@ -63,10 +66,8 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
     if not trials:
         raise InputError('calibration', 'no trials', 'at least one complete trial',
                          'record an initial chain, an action and a goal chain first')
-    begun, choice = clock(), choose(trials, options or Options())
-    options = choice.options
+    begun, options = clock(), options or Options()
     notices: list[str] = []
-    doubts = implausible_trials(trials, options.table_height if options.table else None, bool(options.scene))
 
     def notice(text: str) -> None:
         notices.append(text)
@@ -86,9 +87,10 @@ def calibrate(trials: Sequence[Trial], options: Options | None = None, *,
         result = advised(setting, result)
         result = with_missing_parameters(setting, result)
         result = confirm(result)
+    implausible = implausible_trials(trials, options.table_top, bool(options.scene))
     noticed = (text if count == 1 else f'{text} ({count} times)' for text, count in Counter(notices).items())
-    return replace(result, choice=choice, doubts=doubts, warnings=(*doubts, *result.warnings, *noticed),
-                   seconds=clock() - begun)
+    return replace(result, choice=setting.choice, implausible=implausible, seconds=clock() - begun,
+                   warnings=(*implausible, *result.warnings, *noticed))
 
 
 def fitted(setting: Setting) -> CalibrationResult:
@@ -98,10 +100,10 @@ def fitted(setting: Setting) -> CalibrationResult:
     :raises SimulationError: if no evaluation could be simulated.
     """
     known = prior(setting.trials, setting.options)
-    found = searched(setting, known)
-    found = examined(setting, found)
-    found = replace(found, best=setting.judged(found.space, found.best))
-    return CalibrationResult.of(setting, known, found)
+    best_fit = searched(setting, known)
+    best_fit = examined(setting, best_fit)
+    best_fit = replace(best_fit, best=setting.judged(best_fit.space, best_fit.best))
+    return CalibrationResult.of(setting, known, best_fit)
 
 
 def searched(setting: Setting, known: Prior) -> Fit:

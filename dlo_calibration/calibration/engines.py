@@ -1,33 +1,33 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Engines: the table of simulators that a user can choose, by name."""
+"""Engines: the table of the simulators that a user can choose by name."""
 
 from __future__ import annotations
 
 import functools
 from importlib.util import find_spec
 import logging
-from typing import Any, Callable, Mapping, Sequence, TYPE_CHECKING
+from typing import Any, Callable, Mapping, Sequence
 
 from dlo_calibration.calibration.options import AUTO, Options
 from dlo_calibration.errors import InputError, printable
+from dlo_calibration.evaluation.digest import code_digest, digest
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
 from dlo_calibration.simulation.protocol import Simulator
+from dlo_calibration.simulation.scene import Obstacle, read_scene
 
-if TYPE_CHECKING:
-    from dlo_calibration.simulation.obstacles import Obstacle
+#: Rooms whose code determines an evaluation: with another version of them, it may differ.
+DECISIVE = ('model', 'observation', 'simulation', 'evaluation')
 
 SimulatorFactory = Callable[[Options], Simulator]
 
 
 class NoPyBullet(InputError):
-    """PyBullet is needed, and not installed."""
+    """PyBullet is needed, but not installed."""
 
 
 def _bullet(options: Options) -> Simulator:
-    from dlo_calibration.simulation.obstacles import read_scene
-
     content = f'scene {options.scene}' if options.scene else 'trials'
     if find_spec('pybullet') is None:
         raise NoPyBullet(content if options.scene else 'engine bullet', 'no PyBullet',
@@ -66,6 +66,16 @@ def engine_settings(options: Options) -> dict[str, Any]:
     return {'table': options.table, 'table_height': options.table_height, 'nodes': options.nodes,
             'time_step': options.time_step, 'stable_distance': options.stable_distance,
             'stable_time': options.stable_time, 'settle_limit': options.settle_limit}
+
+
+def engine_digest(options: Options) -> str:
+    """
+    Return a digest of all that determines an evaluation besides trials and parameters: settings, scene, code.
+
+    :raises InputError: if the scene cannot be read.
+    """
+    obstacles = read_scene(options.scene) if options.scene else ()
+    return digest(engine_settings(options), obstacles, code_digest(DECISIVE))
 
 
 @functools.cache

@@ -29,7 +29,7 @@ class Fit:
     :param evaluations: all evaluations, without residuals.
     :param ended: why the search ended, in words.
     :param stopped: whether the user stopped it.
-    :param examination: of the surroundings of the best evaluation; None if the user stopped before.
+    :param examination: around the best evaluation; None if the user stopped before.
     :param parts: how the numbers of parts and knots were chosen, in words; empty if they were given.
     :param model: linear model of the residuals at the best evaluation; None if the search made none.
     :param validated: number of parameter sets simulated to choose the numbers of parts and knots.
@@ -51,11 +51,6 @@ class Fit:
         """Why the calibration ended, in words."""
         return '; '.join(filter(None, ('stopped on request' if self.stopped else self.ended, self.parts)))
 
-    @property
-    def examined(self) -> int:
-        """Number of parameter sets simulated beside the search."""
-        return self.validated + (0 if self.examination is None else self.examination.evaluations)
-
 
 def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, first: int = 0) -> Fit:
     """
@@ -69,34 +64,36 @@ def fit(setting: Setting, space: ParameterSpace, search: Search, budget: int, fi
     :raises SimulationError: if no evaluation could be simulated.
     """
     evaluate = setting.evaluate(space)
-    kept: list[Evaluation] = []
+    evaluations: list[Evaluation] = []
     best: Evaluation | None = None
     stopped = False
-    while len(kept) < budget and not stopped:
-        points = search.ask(budget - len(kept))
+    while len(evaluations) < budget and not stopped:
+        points = search.ask(budget - len(evaluations))
         if not len(points):
             break
         batch: list[Evaluation] = []
-        for evaluation in evaluate(points, first + len(kept)):
+        for evaluation in evaluate(points, first + len(evaluations)):
             batch.append(evaluation)
             setting.on_evaluation(evaluation)
         stopped = len(batch) < len(points)
-        search.tell([Observation(one.point, one.score, one.residuals) for one in batch])
+        search.tell([Observation(evaluation.point, evaluation.score, evaluation.residuals)
+                     for evaluation in batch])
         best = _better(best, batch, search)
-        kept.extend(replace(evaluation, residuals=None) for evaluation in batch)
+        evaluations.extend(replace(evaluation, residuals=None) for evaluation in batch)
     if best is None:
         raise SimulationError('stopped before the first evaluation had finished')
     if not best.scores:
-        raise SimulationError(f'none of {len(kept)} evaluations could be simulated: {best.failure}')
+        raise SimulationError(f'none of {len(evaluations)} evaluations could be simulated: {best.failure}')
     ended = search.stop_reason or f'budget of {first + budget} evaluations spent'
-    return Fit(space, search.name, best, tuple(kept), ended, stopped, model=search.model)
+    return Fit(space, search.name, best, tuple(evaluations), ended, stopped, model=search.model)
 
 
 def _better(best: Evaluation | None, batch: list[Evaluation], search: Search) -> Evaluation | None:
-    """Return the best evaluation by the measure of the search; until there is one, that of lowest score."""
+    """Return the best evaluation by the measure of the search; until it has one, the lowest score counts."""
     chosen = search.best
-    for one in batch:
-        if best is None or best.residuals is None and one.score < best.score or (
-                one.residuals is not None and chosen is not None and np.array_equal(one.point, chosen)):
-            best = one
+    for evaluation in batch:
+        if best is None or best.residuals is None and evaluation.score < best.score or (
+                evaluation.residuals is not None and chosen is not None
+                and np.array_equal(evaluation.point, chosen)):
+            best = evaluation
     return best

@@ -4,28 +4,24 @@
 """
 Options: declared once, here.
 
-ROS parameters with descriptors and ranges, command-line flags, and the options
-recorded in a session are all generated from these declarations.
+ROS parameters with descriptors and ranges, command-line flags, and the options recorded in a session are all
+generated from these declarations. All options that come out of a session, a request or a result pass through
+`file_options`: a file may come from a stranger, so it never chooses machines, processes or folders, and names
+no file outside its own folder.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 import re
-from typing import Any, Mapping, Self
+from types import MappingProxyType
+from typing import Any, Mapping, NoReturn, Self, Sequence
 
-from dlo_calibration.calibration.declaration import (
-    Declaration,
-    declared,
-    DeclaredOptions,
-    MACHINE,
-    OBSERVATION,
-    refuse_name,
-    SEARCH,
-)
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, one_of, suggestion
 from dlo_calibration.model.parameters import (
     BY_NAME,
+    measured,
     MOST_PARTS,
     PAPER_PARAMETERS,
     PARAMETERS,
@@ -34,11 +30,133 @@ from dlo_calibration.model.parameters import (
     SCALE,
 )
 from dlo_calibration.model.pose import NUMBERS, Pose
-from dlo_calibration.model.quantity import measured
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.simulation.protocol import DEFAULT_NODES, DEFAULT_TIME_STEP
 
-AUTO = 'auto'  # calibrate: see `automatic`; engine: the fastest one that supports the options, see CONFIRMING
+#: What an option describes: how trials were observed; what is searched and simulated; or the user's machines,
+#: computer and robot, which no file configures (`file_options`). The mass belongs to the search, though it is
+#: measured: `validate` takes it from the result, because all physical values are proportional to it.
+OBSERVATION, SEARCH, MACHINE = 'observation', 'search', 'machine'
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """
+    One option, with all that ROS and the command line need to declare it.
+
+    :param default: also gives the type of the option: bool, int, float, str, or tuple of str.
+    :param choices: the permitted values of a str, or of each str of a tuple.
+    :param of: OBSERVATION, SEARCH, or MACHINE, which no file sets.
+    """
+
+    name: str
+    default: Any
+    description: str
+    of: str
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def checked(self, value: Any) -> Any:
+        """
+        Return `value` in the option's own type.
+
+        :raises InputError: if it has another type, or is out of range.
+        """
+        kind = type(self.default)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if kind is tuple and isinstance(value, (list, tuple)):
+            value = tuple(value)
+        if kind is tuple and isinstance(value, str):
+            value = (value,)
+        what = f'parameter {self.name}'
+        if type(value) is not kind or kind is tuple and not all(isinstance(v, str) for v in value):
+            names = {bool: 'true or false', int: 'an integer', float: 'a number', str: 'a text',
+                     tuple: 'a list of names' if self.choices else 'a list of texts'}
+            raise InputError(what, f'{value!r}', names[kind], 'give it that type')
+        if self.choices:
+            for choice in value if kind is tuple else (value,):
+                if choice not in self.choices:
+                    raise InputError(what, f'{choice!r}', one_of(self.choices, choice),
+                                     suggestion(choice, self.choices, 'choose one of them'))
+        low, high = self.minimum, self.maximum
+        if kind in (int, float) and not (
+                (low is None or value >= low) and (high is None or value <= high)):
+            raise InputError(what, f'{value:g} {self.unit}'.rstrip(),
+                             f'{"" if low is None else f"{low:g}"} to {"" if high is None else f"{high:g}"}'
+                             f' {self.unit}'.rstrip(), 'choose a value in that range')
+        return value
+
+
+def declared(default: Any, description: str, of: str, **rest: Any) -> Any:
+    """Return a dataclass field that declares an option; its arguments are those of `Declaration`."""
+    return field(default=default, metadata={'description': description, 'of': of, **rest})
+
+
+@dataclass(frozen=True)
+class DeclaredOptions:
+    """
+    Base class of options: frozen dataclasses with a field for each option, see `declared`.
+
+    Command-line flags, ROS parameters and parameter files are generated from their declarations.
+    """
+
+    def __post_init__(self) -> None:
+        for option in self.declarations():
+            if hasattr(self, option.name):
+                object.__setattr__(self, option.name, option.checked(getattr(self, option.name)))
+
+    @classmethod
+    def declarations(cls) -> tuple[Declaration, ...]:
+        """Return the declaration of every option, in the order in which they are shown."""
+        return tuple(Declaration(option.name, option.default, **option.metadata)
+                     for option in fields(cls) if option.metadata)
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> Self:
+        """
+        Build from a flat mapping of option names to values.
+
+        :raises InputError: for an unknown name, a wrong type, or a value out of range.
+        """
+        known = [option.name for option in cls.declarations()]
+        for name in options:
+            if name not in known:
+                refuse_name(name, known)
+        return cls._built(options)
+
+    @classmethod
+    def _built(cls, options: Mapping[str, Any]) -> Self:
+        return cls(**options)
+
+    def flat(self) -> dict[str, Any]:
+        """Return all options by name, as `of` takes them; tuples as lists."""
+        values = {option.name: self._value(option.name) for option in self.declarations()}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def _value(self, name: str) -> Any:
+        return getattr(self, name)
+
+    def check_together(self) -> None:
+        """
+        Check several options together.
+
+        :raises InputError: if they contradict each other.
+        """
+
+
+def refuse_name(name: str, known: Sequence[str]) -> NoReturn:
+    """Raise the InputError for an option with an unknown name."""
+    raise InputError('parameter', repr(name), f'{one_of(known, name)} in doc/messages.md',
+                     suggestion(name, known, 'correct the name'))
+
+
+#: The options that a simulation needs.
+SIMULATION = ('table', 'table_height', 'scene', 'engine', 'nodes', 'time_step', 'stable_distance',
+              'stable_time', 'settle_limit', 'answer_limit')
+AUTO = 'auto'  # calibrate: see `choice`; engine: the fastest one that supports the options, see CONFIRMING
 CONFIRMING = 'bullet'  # the engine that checks the result of `auto`
 
 
@@ -127,7 +245,7 @@ class Options(DeclaredOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         given = {name: FIXED_VALUES[name].checked(value) if name in FIXED_VALUES else
-                 refuse_name(name, [one.name for one in declarations()])
+                 refuse_name(name, [option.name for option in Options.declarations()])
                  for name, value in self.values.items()}
         object.__setattr__(
             self, 'values', {name: given.get(name, d.default) for name, d in FIXED_VALUES.items()})
@@ -141,7 +259,7 @@ class Options(DeclaredOptions):
     @classmethod
     def declarations(cls) -> tuple[Declaration, ...]:
         """Return the declaration of every option, in the order in which they are shown."""
-        return (*cls._declared_fields(), *FIXED_VALUES.values())
+        return (*super().declarations(), *FIXED_VALUES.values())
 
     @classmethod
     def _built(cls, options: Mapping[str, Any]) -> Self:
@@ -158,6 +276,11 @@ class Options(DeclaredOptions):
         :raises InputError: if they contradict each other.
         """
         self.space  # noqa: B018
+
+    @property
+    def table_top(self) -> float | None:
+        """Height of the table top [m]; None: there is no table."""
+        return self.table_height if self.table else None
 
     @property
     def table_frame(self) -> str | None:
@@ -181,7 +304,7 @@ class Options(DeclaredOptions):
         """
         The parameters to find, and the fixed values of the others.
 
-        Where `calibrate` is auto, these are the paper's parameters, which it always finds; `automatic.choose`
+        Where `calibrate` is auto, these are the paper's parameters, which it always finds; `choice.choose`
         adds those that the trials show.
         """
         named = ParameterSpace(self._names)
@@ -204,11 +327,91 @@ FIXED_VALUES: Mapping[str, Declaration] = {
     for p in PARAMETERS if p.name != 'mass'}  # the mass is an option in kg
 
 
-def declarations() -> tuple[Declaration, ...]:
-    """Return the declaration of every option, in the order in which they are shown."""
-    return Options.declarations()
-
-
 def names_of(kind: str) -> tuple[str, ...]:
     """Return the names of the options of a kind: OBSERVATION, SEARCH or MACHINE."""
-    return tuple(declaration.name for declaration in declarations() if declaration.of == kind)
+    return tuple(declaration.name for declaration in Options.declarations() if declaration.of == kind)
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """
+    Options of a file, by name.
+
+    :param values: those to use, without the machine's; `scene` is an absolute path.
+    :param problems: warnings about what is left out.
+    :param refusal: why the scene is left out; without its scene, nothing can be simulated.
+    """
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    refusal: InputError | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'values', MappingProxyType(dict(self.values)))
+
+    def options(self, given: Mapping[str, Any] = MappingProxyType({})) -> Options:
+        """
+        Return all options: those of the file, overridden by `given` ones; else the defaults.
+
+        :raises InputError: if the file names a scene that cannot be used, and `given` has none.
+        """
+        if self.refusal is not None and 'scene' not in given:
+            raise self.refusal
+        return Options.of({**self.values, **given})
+
+
+def file_options(given: Mapping[str, Any], folder: Path | None) -> FileOptions:
+    """
+    Return the options of a file that this version accepts and that a file may set.
+
+    :param given: as in the file, of any names, types and values.
+    :param folder: of the file; None: the options came in a message or as bytes.
+    """
+    usable: dict[str, Any] = {}
+    problems = []
+    for name, value in given.items():
+        try:
+            Options.of({name: value})
+        except InputError as error:
+            problems.append(f'a recorded option is left out: {error}')
+        else:
+            usable[name] = value
+    defaults = Options().flat()
+    ignored = [name for name in names_of(MACHINE) if usable.pop(name, defaults[name]) != defaults[name]]
+    if ignored:
+        problems.append(f'recorded options are left out, as only the command line or the node may set them: '
+                        f'{", ".join(ignored)}')
+    try:
+        if usable.get('scene'):
+            usable['scene'] = str(_scene(usable['scene'], folder))
+    except InputError as error:
+        del usable['scene']
+        return FileOptions(usable, (*problems, str(error)), error)
+    return FileOptions(usable, tuple(problems))
+
+
+def recordable(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that a file records: all except those of the machines."""
+    machine = names_of(MACHINE)
+    return {name: value for name, value in options.items() if name not in machine}
+
+
+def _scene(name: str, folder: Path | None) -> Path:
+    """
+    Return the path of a scene that a file names, if it lies in the folder of the file.
+
+    If the recorded path leads elsewhere, a scene of the same name in that folder is used.
+
+    :raises InputError: if the folder has no such regular file, whatever lies elsewhere.
+    """
+    if folder is not None:
+        try:
+            home = folder.resolve()
+            for path in ((home / name).resolve(), (home / Path(name).name).resolve()):
+                if path.is_relative_to(home) and path.is_file():
+                    return path
+        except (OSError, ValueError, RuntimeError):  # a name that no file can have, or a loop of links
+            pass
+    raise InputError(f'recorded scene {name}', 'no such file in the folder of the recording',
+                     'a scene that lies there' if folder is not None else 'no scene',
+                     'copy the scene to that folder, or give it with --scene')

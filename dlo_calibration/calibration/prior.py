@@ -18,13 +18,13 @@ from dlo_calibration.observation.estimate import start_point
 from dlo_calibration.observation.excitation import excites
 from dlo_calibration.search import Hints
 
-#: Physical values of a cable in SI units. With them, half of the searches' start points differ only in
-#: stiffness: from points where all values are random, a search of so many parameters rarely finds the
-#: friction between strands, as much damping explains nearly as much.
+#: Physical values of a cable in SI units. Half of the start points of a search take them and differ only in
+#: stiffness: from random points, a search of so many parameters rarely finds the friction between strands,
+#: because strong damping explains the trials nearly as well.
 CABLE = {'elasticity': 100.0, 'damping': 0.3, 'internal_damping': 0.004, 'torsion': 2 / 3,
          'bending_friction': 1.0, 'bending_slip': 0.5}
 
-#: The height at which the DLO lies gives this radius, even if no trial shows self-contact.
+#: The parameter of the radius, which the height of the resting DLO gives even without self-contact.
 GUESSED = 'self_collision'
 
 
@@ -45,8 +45,7 @@ class Prior:
 
 def prior(trials: Sequence[Trial], options: Options) -> Prior:
     """Return the prior of the parameters to find, from the observed chains alone."""
-    space = options.space
-    height = options.table_height if options.table else None
+    space, height = options.space, options.table_top
     shown = np.logical_or.reduce(excites(trials, space, height))
     hints = Hints(_with_cable(space, start_point(trials, space, height)), shown)
     default = BY_NAME[GUESSED].default
@@ -59,7 +58,7 @@ def prior(trials: Sequence[Trial], options: Options) -> Prior:
 
 
 def _with_cable(space: ParameterSpace, start: Floats) -> Floats:
-    """Return the (d,) prior estimate with values of a cable where friction between strands is to be found."""
+    """Return the (d,) prior estimate, with values of a cable if friction between strands is calibrated."""
     if 'bending_friction' not in space.free:
         return start
     cable = np.array([BY_NAME[name].value(CABLE[name]) / SCALE if name in CABLE else np.nan

@@ -5,22 +5,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Mapping, Sequence
+import math
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.automatic import Choice
+from dlo_calibration.calibration.choice import Choice
 from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.prior import Prior
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.evaluator import mean_length
+from dlo_calibration.evaluation.evaluation import Evaluation, mean_length
 from dlo_calibration.evaluation.residuals import at_every_goal, ResidualLayout
 from dlo_calibration.inference.advice import Advice
-from dlo_calibration.inference.confirmation import Confirmation, DISTANCE_TOLERANCE
-from dlo_calibration.inference.examination import Examination
+from dlo_calibration.inference.examination import Confirmation, DISTANCE_TOLERANCE, Examination
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.uncertainty import (
     IDENTIFIABLE,
@@ -31,12 +30,11 @@ from dlo_calibration.inference.uncertainty import (
     Uncertainty,
 )
 from dlo_calibration.model.chain import Floats, frozen_array, put_back
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, SCALE
-from dlo_calibration.model.quantity import measured, number
+from dlo_calibration.model.parameters import BY_NAME, measured, number, ParameterSpace, SCALE
 from dlo_calibration.model.score import observed, PointErrors
 from dlo_calibration.model.trial import Trial
 
-WORST = 0.1  # of the length; good models of real DLOs are 0.3 to 3 % of it from the measured points
+WORST = 0.1  # of the length; good models of real DLOs miss the measured points by 0.3 to 3 % of it
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class ParameterEstimate:
 
     :param identifiable: False if the trials do not determine the value.
     :param verdict: identifiable, weak, or not identifiable, by the width of the interval; see `uncertainty`.
-    :param note: a remark for the user; may be empty.
+    :param note: a warning; may be empty.
     """
 
     name: str
@@ -72,12 +70,12 @@ class CalibrationResult:
     The result of a calibration.
 
     :param chains: (g, n, 3) simulated chains at the goals of each trial [m].
-    :param examination: of the surroundings of the best evaluation; None if the user stopped before.
+    :param examination: around the best evaluation; None if the user stopped before.
     :param advice: which action to observe next; None if none would help, or it was not computed.
     :param missing_parameters: fixed parameters that would explain part of the residuals; empty if noise
         explains the residuals, or if it was not computed.
-    :param choice: the options with what was decided from the trials; None: nothing was calibrated.
-    :param doubts: what cannot be right about the trials, see `plausibility`; they are warnings, too.
+    :param choice: the decided options; None: nothing was calibrated.
+    :param implausible: why the trials cannot be as described, see `plausibility`; `warnings` has it, too.
     """
 
     space: ParameterSpace
@@ -97,36 +95,36 @@ class CalibrationResult:
     advice: Advice | None = None
     missing_parameters: tuple[MissingParameter, ...] = ()
     choice: Choice | None = None
-    doubts: tuple[str, ...] = ()
+    implausible: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, setting: Setting, known: Prior, found: Fit) -> CalibrationResult:
+    def of(cls, setting: Setting, prior: Prior, fit: Fit) -> CalibrationResult:
         """Return the result of a fit; `seconds` is 0 until the calibration has ended."""
-        trials, best, examination = setting.trials, found.best, found.examination
-        uncertainty = spread_of_best(found.evaluations, best.point)
+        trials, best, examination = setting.trials, fit.best, fit.examination
+        uncertainty = spread_of_best(fit.evaluations, best.point)
         if examination is not None:
             uncertainty = examination.uncertainty if examination.regular else uncertainty.of_excited(
                 examination.uncertainty.excited)
         return cls(
-            space=found.space, best=best, trials=trials,
-            parameters=parameter_estimates(found.space, best, uncertainty, known.guessed),
-            chains=simulated_chains(trials, best), evaluations=found.evaluations, seconds=0.0,
-            search=found.search, engine=setting.simulator.name, stop_reason=found.stop_reason,
-            seed=setting.options.seed, warnings=_warnings(best, found.evaluations), examination=examination)
+            space=fit.space, best=best, trials=trials,
+            parameters=parameter_estimates(fit.space, best, uncertainty, prior.guessed),
+            chains=simulated_chains(trials, best), evaluations=fit.evaluations, seconds=0.0,
+            search=fit.search, engine=setting.simulator.name, stop_reason=fit.stop_reason,
+            seed=setting.options.seed, warnings=_warnings(best, fit.evaluations), examination=examination)
 
     @property
     def unusable(self) -> str:
         """
         Why the parameters should not be used, in one sentence; '' if they can be.
 
-        The reasons, the first of which counts: a trial cannot be what it is said to be; the fit is far worse
-        than a model of a DLO is, or not better than the default parameters though noise does not explain it;
-        two engines differ by more than the fit from the measurement; the search was stopped or ended before a
-        minimum; the trials determine no parameter.
+        The first of these reasons counts: a trial is implausible; the fit is far worse than models of DLOs
+        are; two engines differ by more than the fit misses the measurement; the search ended before a
+        minimum; the fit is not better than the default parameters, though noise does not explain it; the
+        trials determine no parameter.
         """
-        mean, found, other = self.errors.mean, self.examination, self.confirmation
-        if self.doubts:
-            return self.doubts[0]
+        mean, examination, other = self.errors.mean, self.examination, self.confirmation
+        if self.implausible:
+            return self.implausible[0]
         if mean > WORST * self.length:
             return (f'the simulated points are {measured(mean, "m")} from the measured ones on average, '
                     f'{number(100 * mean / self.length)} % of the length: check frames, grips and clocks')
@@ -136,13 +134,13 @@ class CalibrationResult:
             return (f'engine {other.engine} differs from {self.engine} by '
                     f'{measured(other.mean_distance, "m")}, '
                     'more than the fit from the measurement: check the trials on which they disagree')
-        if found is None or not found.regular:
+        if examination is None or not examination.regular:
             return (f'the search has not reached a minimum ({self.stop_reason}): calibrate with more '
                     'evaluations or another search')
-        if mean >= found.default_error and not found.noise_alone:
-            return (f'the default parameters fit as well ({measured(found.default_error, "m")} on average), '
-                    'and noise does not explain what is left: check frames, grips and clocks')
-        if all(one.verdict == NOT_IDENTIFIABLE for one in self.parameters.values()):
+        if mean >= examination.default_error and not examination.noise_alone:
+            return (f'the default parameters fit as well ({measured(examination.default_error, "m")} on '
+                    'average), and noise does not explain what is left: check frames, grips and clocks')
+        if all(estimate.verdict == NOT_IDENTIFIABLE for estimate in self.parameters.values()):
             return 'these trials determine none of the parameters: observe an action that shows one'
         return ''
 
@@ -154,19 +152,20 @@ class CalibrationResult:
     @property
     def correlations(self) -> dict[str, dict[str, float]] | None:
         """Correlation of each pair of found parameters, by name; None if it is unknown."""
-        found, names = self.examination, self.space.free
-        if found is None or not found.regular or found.uncertainty.correlations is None:
+        examination, names = self.examination, self.space.free
+        if examination is None or not examination.regular or examination.uncertainty.correlations is None:
             return None
-        return {one: dict(zip(names, map(float, row), strict=True))
-                for one, row in zip(names, found.uncertainty.correlations, strict=True)}
+        return {name: dict(zip(names, map(float, row), strict=True))
+                for name, row in zip(names, examination.uncertainty.correlations, strict=True)}
 
     @cached_property
     def band(self) -> Floats | None:
-        """(p,) standard deviation of each simulated goal point [m], from the parameters'; None: unknown."""
-        found = self.examination
-        if found is None or not found.regular or found.uncertainty.covariance is None:
+        """(p,) standard deviation of each simulated goal point due to the parameters' [m]; None: unknown."""
+        examination = self.examination
+        if examination is None or not examination.regular or examination.uncertainty.covariance is None:
             return None
-        return at_every_goal(predictive_std(found.jacobian, found.uncertainty.covariance), self.trials)
+        return at_every_goal(
+            predictive_std(examination.jacobian, examination.uncertainty.covariance), self.trials)
 
     @property
     def std(self) -> Floats:
@@ -204,7 +203,7 @@ class CalibrationResult:
         return self.space.physical(self.values, self.length)
 
 
-def parameter_estimates(space: ParameterSpace, best: Evaluation, found: Uncertainty,
+def parameter_estimates(space: ParameterSpace, best: Evaluation, uncertainty: Uncertainty,
                         guessed: Sequence[str] = ()) -> dict[str, ParameterEstimate]:
     """
     Return the parameters of the best evaluation with their uncertainty, in both units.
@@ -213,23 +212,24 @@ def parameter_estimates(space: ParameterSpace, best: Evaluation, found: Uncertai
     """
     parameters = {}
     for k, name in enumerate(space.free):
-        value, lower, upper = (float(x) * SCALE for x in (best.point[k], found.lower[k], found.upper[k]))
+        value, lower, upper = (float(x) * SCALE for x in (
+            best.point[k], uncertainty.lower[k], uncertainty.upper[k]))
         (at_value, unit), (at_lower, _), (at_upper, _) = (
             space.reported(name, x) for x in (value, lower, upper))
         note = ''
-        if not found.excited[k]:
+        if not uncertainty.excited[k]:
             note = 'no trial shows it; it keeps its default'
             if name in guessed:
                 note = 'no trial shows it; estimated from the height at which the DLO lies'
         low, high = sorted((at_lower, at_upper))
-        verdict = found.verdicts[k]
-        if found.excited[k] and (lower <= 0) != (upper >= SCALE):
+        verdict = uncertainty.verdicts[k]
+        if uncertainty.excited[k] and (lower <= 0) != (upper >= SCALE):
             words = BY_NAME[name].interval(lower, upper, (low, high), unit)
             note = f'{words}: the interval reaches the end of the scale'
-            if found.at_bound[k]:
+            if uncertainty.at_bound[k]:
                 note += ', where the best value is'
         parameters[name] = ParameterEstimate(
-            name, value, float(found.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
+            name, value, float(uncertainty.std[k]) * SCALE, lower, upper, at_value, low, high, unit,
             verdict == IDENTIFIABLE, verdict, note)
     return parameters
 
@@ -248,17 +248,17 @@ def combination(names: Sequence[str], vector: Floats) -> str:
 
 
 def simulated_chains(trials: Sequence[Trial], evaluation: Evaluation) -> tuple[Floats, ...]:
-    """Return the simulated chains of each trial, (g, n, 3) [m], from the residuals of an evaluation."""
+    """Return the simulated chains of each trial, (g, n, 3) [m]: measured chains plus residuals."""
     assert evaluation.residuals is not None
     apart = ResidualLayout.of(trials).chains(evaluation.residuals)
-    found = []
+    simulated = []
     for trial, away in zip(trials, apart, strict=True):
         chains, places = observed(trial) + away, trial.initial.arc_lengths()
         for k, goal in enumerate(trial.goals):
             if not goal.chain.seen.all():  # nothing was compared there
                 chains[k] = put_back(chains[k], goal.chain.seen, places)
-        found.append(frozen_array(chains))
-    return tuple(found)
+        simulated.append(frozen_array(chains))
+    return tuple(simulated)
 
 
 def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str, ...]:
@@ -270,3 +270,67 @@ def _warnings(best: Evaluation, evaluations: Sequence[Evaluation]) -> tuple[str,
         warnings.append(f'{len(failed)} of {len(evaluations)} evaluations could not be simulated: '
                         f'{failed[0].failure}')
     return tuple(warnings)
+
+
+def plain(result: CalibrationResult) -> dict[str, Any]:
+    """
+    Return a result as plain values, under the keys that `fit --json` prints.
+
+    Units are SI; scores are in cm; `value`, `std`, `lower` and `upper` are on the scale from 0 to 100.
+    None stands for an unknown value.
+    """
+    examination, other, advice = result.examination, result.confirmation, result.advice
+    values: dict[str, Any] = with_nulls({
+        'unusable': result.unusable,
+        'parameters': {name: {key: value for key, value in asdict(estimate).items() if key != 'name'}
+                       for name, estimate in result.parameters.items()},
+        **_fit(result.best.score, result.best.scores, result.errors),
+        'error_percent_of_length': 100 * result.errors.mean / result.length,
+        'trials': len(result.trials), 'evaluations': len(result.evaluations),
+        'simulations': result.simulations, 'seconds': result.seconds, 'engine': result.engine,
+        'search': result.search, 'seed': result.seed, 'stop_reason': result.stop_reason,
+        'choice': result.choice.words if result.choice else '',
+        'warnings': result.warnings,
+        'cross_validated_error_m': examination and examination.cross_validated,
+        'default_error_m': examination and examination.default_error,
+        'noise_m': examination and examination.noise,
+        'residual_std_m': examination and examination.uncertainty.residual,
+        'correlations': result.correlations, 'undetermined': result.undetermined,
+        'advice': advice and {**asdict(advice), **{key: getattr(advice, key) * SCALE for key in (
+            'std', 'expected_std', 'lower', 'upper')}},
+        'explanations': {missing.name: missing.share for missing in result.missing_parameters},
+        'confirmation': other and {
+            'engine': other.engine, **_fit(other.score, other.scores, other.errors),
+            'mean_distance_m': other.mean_distance, 'max_distance_m': other.max_distance}})
+    return values
+
+
+def evaluation_rows(result: CalibrationResult) -> tuple[list[str], list[list[Any]]]:
+    """
+    Return the header and the rows of a table of all evaluations, which are numbered from 1.
+
+    Parameters are on the scale from 0 to 100, scores in cm, the mean point error in m. A failed evaluation
+    leaves cells empty.
+    """
+    names, trials = result.space.free, [trial.name for trial in result.trials]
+    head = ['evaluation', *names, 'score', *(f'score of {name}' for name in trials), 'mean_error_m',
+            'failure']
+    return head, [
+        [evaluation.index + 1, *(evaluation.values[name] for name in names), evaluation.score,
+         *(evaluation.scores or [''] * len(trials)),
+         '' if evaluation.errors is None else evaluation.errors.mean, evaluation.failure]
+        for evaluation in result.evaluations]
+
+
+def with_nulls(value: Any) -> Any:
+    """Replace numbers that are not finite, which JSON cannot express, by None."""
+    if isinstance(value, Mapping):
+        return {str(key): with_nulls(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [with_nulls(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _fit(score: float, scores: Sequence[float], errors: PointErrors) -> dict[str, Any]:
+    return {'score': score, 'scores': scores, 'mean_error_m': errors.mean, 'rms_error_m': errors.rms,
+            'max_error_m': errors.max, 'mean_abs_error_m': errors.mean_abs}

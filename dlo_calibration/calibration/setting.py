@@ -10,18 +10,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Callable
 
-from dlo_calibration.calibration.automatic import choose, chooses_parts
+from dlo_calibration.calibration.choice import Choice, choose, chooses_parts
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import SimulationError
 from dlo_calibration.evaluation.batch import BatchEvaluator
-from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
+from dlo_calibration.evaluation.log import Memory
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.evaluation.residuals import compared_rows
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.rest_lengths import with_shared_places
+from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.simulation.protocol import Simulator
 
 
@@ -30,11 +29,11 @@ class Setting:
     """
     The trials, options, engine and callbacks that all stages of a calibration share.
 
-    :param trials: to calibrate on, at least one; those with the same points get the same rest arc lengths.
-    :param options: those that are open are decided from the trials.
+    :param trials: at least one; those with the same points get the same rest arc lengths.
+    :param options: open ones are decided from the trials, see `choice`.
     :param simulator: the engine.
     :param executor: its workers simulate; None: one thread.
-    :param should_stop: asked often; once True, every stage ends with what it has so far.
+    :param should_stop: polled; once it returns True, every stage ends with what it has so far.
     :param on_evaluation: called with each finished evaluation of the search, in the order asked.
     :param memory: what was simulated before an interruption; every stage asks it first.
     """
@@ -46,10 +45,12 @@ class Setting:
     should_stop: Callable[[], bool] = lambda: False
     on_evaluation: Callable[[Evaluation], None] = lambda _: None
     memory: Memory = field(default_factory=Memory)
+    choice: Choice = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'choice', choose(self.trials, self.options))
+        object.__setattr__(self, 'options', self.choice.options)
         object.__setattr__(self, 'trials', with_shared_places(self.trials))
-        object.__setattr__(self, 'options', choose(self.trials, self.options).options)
 
     @property
     def chooses_parts(self) -> bool:
@@ -70,28 +71,27 @@ class Setting:
 
         :param finer: simulates in place of the setting's pool.
         """
-        if trials is None and finer is None:
-            return self._usual.of(space, self.memory)
         pool = finer or self.pool
-        evaluator = Evaluator(trials or self.trials, space, pool.simulator, every_goal=False)
+        evaluator = self._evaluator.of(space) if trials is None and finer is None else \
+            Evaluator(trials or self.trials, space, pool.simulator, every_goal=False)
         return BatchEvaluator(evaluator, pool, self.memory.of(evaluator, finer is not None))
 
     @cached_property
-    def _usual(self) -> BatchEvaluator:
-        return BatchEvaluator(Evaluator(self.trials, self.options.space, self.simulator, every_goal=False),
-                              self.pool)
+    def _evaluator(self) -> Evaluator:
+        return Evaluator(self.trials, self.options.space, self.simulator, every_goal=False)
 
-    def judged(self, space: ParameterSpace, one: Evaluation) -> Evaluation:
+    def judged(self, space: ParameterSpace, evaluation: Evaluation) -> Evaluation:
         """
-        Return an evaluation with its residuals at every goal: it is simulated again if they were not kept.
+        Return an evaluation with its residuals at every goal; if it has none, simulate it again.
 
         :raises SimulationError: if it cannot be simulated again.
         """
         if compared_rows(self.trials) is None:
-            return one
+            return evaluation
         evaluator = Evaluator(self.trials, space, self.simulator)
         pool = Pool(self.simulator, self.executor, memory=self.memory)  # also after a stop
-        found = evaluator.evaluated(one.index, one.point, pool.simulate(evaluator.jobs(one.point)))
-        if found.residuals is None:
-            raise SimulationError(found.failure)
-        return found
+        point = evaluation.point
+        repeated = evaluator.evaluated(evaluation.index, point, pool.simulate(evaluator.jobs(point)))
+        if repeated.residuals is None:
+            raise SimulationError(repeated.failure)
+        return repeated

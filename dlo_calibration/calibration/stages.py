@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stages after the fit: advice, missing parameters, confirmation. None of them changes what was found."""
+"""The stages after the search: examination, advice, missing parameters, confirmation by a second engine."""
 
 from __future__ import annotations
 
 from concurrent.futures import CancelledError
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import replace
 from functools import partial
 import time
@@ -15,26 +15,105 @@ from typing import Callable, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.engines import NoPyBullet, SimulatorFactory
+from dlo_calibration.calibration.fit import Fit
 from dlo_calibration.calibration.options import AUTO, CONFIRMING, Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.setting import Setting
-from dlo_calibration.errors import DloCalibrationError, SimulationError
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.errors import one_line, SimulationError
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.log import Memory
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
-from dlo_calibration.evaluation.residuals import compared_rows
+from dlo_calibration.evaluation.residuals import compared_rows, Huber, ResidualLayout
 from dlo_calibration.inference.advice import advise
-from dlo_calibration.inference.confirmation import Confirmation, disagreements
+from dlo_calibration.inference.examination import Confirmation, disagreements, Examination, examine
 from dlo_calibration.inference.missing_parameters import missing_parameters
 from dlo_calibration.inference.slices import simulate_slices, Slices
+from dlo_calibration.inference.uncertainty import Uncertainty
+from dlo_calibration.model.chain import Floats
+from dlo_calibration.model.parameters import REST_SHAPE
+from dlo_calibration.observation.noise import NO_NOISE, noise, with_other_noise
 from dlo_calibration.simulation.protocol import Rollout, Simulator
 
-STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop, which users wait for
+CHAINS = 16  # initial chains with other noise, over all trials
+STOPPED_PATIENCE = 5.0  # s that a confirmation may take after a request to stop
 
 #: Adds the confirmation by a second engine to a result.
 Confirm = Callable[[CalibrationResult], CalibrationResult]
+
+
+def examined(setting: Setting, fit: Fit) -> Fit:
+    """
+    Return a fit with the examination around its best evaluation, and with the evaluation to report.
+
+    A parameter that no trial excites gets its default instead of a random value, unless the fit becomes
+    significantly worse. If the user stops, there is no examination.
+    """
+    if fit.stopped:
+        return replace(fit, examination=None)
+    try:
+        examination, best = _examined(setting, fit)
+    except CancelledError:
+        return replace(fit, examination=None, stopped=True)
+    count = examination.evaluations + fit.validated
+    return replace(fit, best=best, validated=0, examination=replace(examination, evaluations=count))
+
+
+def _examined(setting: Setting, fit: Fit) -> tuple[Examination, Evaluation]:
+    """
+    Return the examination, and the evaluation to report as the best.
+
+    :raises CancelledError: when stopped.
+    """
+    trials, space, best = setting.trials, fit.space, fit.best
+    assert best.residuals is not None
+    default, sigma = space.default_point(), noise(trials)
+    finer = setting.pool.refined()
+    noisy = sigma > NO_NOISE and 'length_scale' not in space.free
+    evaluate = setting.evaluate(space)
+    drawn = with_other_noise(
+        trials, sigma, -(-CHAINS // len(trials)), np.random.default_rng(0)) if noisy else []
+    here = best.point[None, :]
+    try:
+        # These begin first: they depend on nothing that follows, and occupy threads that would wait.
+        fine = None if finer is None else setting.evaluate(space, finer=finer).begin(here)
+        starts = [setting.evaluate(space, others).begin(here) for others in drawn]
+        examination = examine(
+            best.point, best.residuals, ResidualLayout.compared(trials), evaluate.residuals,
+            default=default, noise=sigma, finer=fine, starts=starts,
+            fading=np.array([name not in REST_SHAPE for name in space.free]))
+    finally:
+        if finer is not None:
+            finer.simulator.close()
+    uncertainty, jacobian = examination.uncertainty, examination.jacobian
+    point, again = np.where(uncertainty.excited, best.point, default), best
+    if not np.array_equal(point, best.point):
+        model = Linearisation(best.point, best.residuals, jacobian).at(point)
+        step = np.clip(_step(model, uncertainty), -0.1, 0.1)
+        points = np.stack([point, np.clip(point + step, 0.0, 1.0)])
+        seen = list(evaluate(points, best.index))
+        if len(seen) < len(points):
+            raise CancelledError
+        loss = Huber.of(best.residuals)
+        again = replace(min(seen, key=lambda evaluation: loss.cost(evaluation.residuals)), index=best.index)
+        examination = replace(examination, evaluations=examination.evaluations + len(points))
+        # The cost is half the sum of squares; 10 % exceed a chi-square of 2.71 with one degree of freedom.
+        worse = 2 * (loss.cost(again.residuals) - loss.cost(best.residuals)) / uncertainty.scale**2
+        if worse > 2.71 * int((point != best.point).sum()):  # the defaults fit worse: the best values stay
+            again = best
+            uncertainty = replace(uncertainty, excited=uncertainty.excited | (point != best.point))
+    assert again.residuals is not None
+    remaining = _step(Linearisation(again.point, again.residuals, jacobian), examination.uncertainty)
+    return replace(examination, uncertainty=uncertainty.at(best.point, again.point, remaining)), again
+
+
+def _step(fit: Linearisation, uncertainty: Uncertainty) -> Floats:
+    """Return the (d,) Gauss-Newton step of the excited parameters, within the unit cube."""
+    step = np.zeros(len(fit.point))
+    free = fit.columns(uncertainty.excited).weighted(Huber.of(fit.residuals).roots(fit.residuals))
+    step[uncertainty.excited] = free.step(np.eye(len(free.point)) * uncertainty.residual**2)
+    return np.asarray(np.clip(fit.point + step, 0.0, 1.0) - fit.point)
 
 
 def advised(setting: Setting, result: CalibrationResult) -> CalibrationResult:
@@ -55,14 +134,14 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
 
     Each of them is simulated once, and only if noise alone does not explain the residuals.
     """
-    found, best = result.examination, result.best
-    if found is None or not found.regular or best.residuals is None or found.noise_alone:
+    examination, best = result.examination, result.best
+    if examination is None or not examination.regular or best.residuals is None or examination.noise_alone:
         return result
     rows = compared_rows(result.trials)
     try:
         return replace(result, missing_parameters=missing_parameters(
             result.space, setting.evaluate, Linearisation(
-                best.point, best.residuals if rows is None else best.residuals[rows], found.jacobian),
+                best.point, best.residuals if rows is None else best.residuals[rows], examination.jacobian),
             parts=not setting.chooses_parts))
     except CancelledError:
         return result
@@ -72,21 +151,18 @@ def with_missing_parameters(setting: Setting, result: CalibrationResult) -> Cali
 def second_engine(options: Options, make_simulator: SimulatorFactory, first: str
                   ) -> Iterator[Simulator | Exception | None]:
     """
-    Make the engine that confirms the result; its process starts while others search.
+    Make the engine that confirms the result; its process starts during the search.
 
-    :param first: name of the engine that is used; it does not confirm itself.
-    :return: None if `options` name an engine (not auto); why there is none, if it cannot be made.
+    :param first: name of the engine that searches; it does not confirm itself.
+    :return: None if no confirmation is wanted; an exception if the engine cannot be made.
     """
     simulator: Simulator | Exception | None = None
-    if options.engine == AUTO and first != CONFIRMING:
-        try:
-            simulator = make_simulator(replace(options, engine=CONFIRMING))
-        except Exception as error:
-            simulator = error
-    if simulator is None or isinstance(simulator, Exception):
-        yield simulator
-        return
-    with closing(simulator):
+    with ExitStack() as stack:
+        if options.engine == AUTO and first != CONFIRMING:
+            try:
+                simulator = stack.enter_context(closing(make_simulator(replace(options, engine=CONFIRMING))))
+            except Exception as error:
+                simulator = error
         if isinstance(simulator, ProcessSimulator):
             simulator.start()
         yield simulator
@@ -97,24 +173,23 @@ def confirming(result: CalibrationResult, second: Simulator | Exception | None,
                should_stop: Callable[[], bool] = lambda: False, memory: Memory | None = None
                ) -> Iterator[Confirm]:
     """
-    Simulate the best parameter set with the second engine beside this block.
+    Simulate the best parameter set with the second engine while this block executes.
 
-    This costs one evaluation. If the engines disagree, or the second one fails, the result only gets a
-    warning.
+    This costs one evaluation. If the engines disagree or the second one fails, the result gets a warning.
 
     :param second: see `second_engine`.
     :param memory: what was simulated before an interruption; None: nothing.
-    :return: what waits for the second engine; other stages may add to the result before.
+    :return: adds the confirmation to a result; it waits for the second engine.
     """
     begun = time.monotonic()
 
     def late() -> bool:
         return should_stop() and time.monotonic() - begun > STOPPED_PATIENCE
 
-    if second is None or isinstance(second, Exception):
-        yield _as_it_is if second is None else partial(_unconfirmed, second)
-    elif second.name == result.engine:
-        yield _as_it_is
+    if isinstance(second, Exception):
+        yield partial(_unconfirmed, second)
+    elif second is None or second.name == result.engine:
+        yield lambda unconfirmed: unconfirmed
     else:
         evaluator = Evaluator(result.trials, result.space, second)
         with closing(Threads(1)) as thread:
@@ -133,14 +208,9 @@ def confirmed(result: CalibrationResult, options: Options, make_simulator: Simul
         return confirm(result)
 
 
-def _as_it_is(result: CalibrationResult) -> CalibrationResult:
-    return result
-
-
 def _unconfirmed(error: Exception, result: CalibrationResult) -> CalibrationResult:
     """Return a result with a warning that says why no second engine confirmed it."""
-    words = str(error) if isinstance(error, DloCalibrationError) else f'{type(error).__name__}: {error}'
-    words = f'not confirmed by engine {CONFIRMING}: {" ".join(words.split())}'
+    words = f'not confirmed by engine {CONFIRMING}: {one_line(error)}'
     if isinstance(error, CancelledError):
         words = f'not confirmed by engine {CONFIRMING}: stopped on request'
     elif isinstance(error, NoPyBullet):
@@ -150,7 +220,7 @@ def _unconfirmed(error: Exception, result: CalibrationResult) -> CalibrationResu
 
 def _confirmed(evaluator: Evaluator, rollouts: Callable[[], Sequence[Rollout | SimulationError]],
                result: CalibrationResult) -> CalibrationResult:
-    """Return a result with what the second engine found; it is waited for."""
+    """Wait for the second engine, and return a result with its confirmation."""
     best, engine = result.best, evaluator.simulator.name
     try:
         other = evaluator.evaluated(best.index, best.point, rollouts())
@@ -159,24 +229,24 @@ def _confirmed(evaluator: Evaluator, rollouts: Callable[[], Sequence[Rollout | S
     except Exception as error:
         return _unconfirmed(error, result)
     chains = simulated_chains(result.trials, other)
-    apart = np.concatenate([np.linalg.norm(one - two, axis=2).ravel()
-                            for one, two in zip(result.chains, chains, strict=True)])
+    apart = np.concatenate([np.linalg.norm(first - second, axis=2).ravel()
+                            for first, second in zip(result.chains, chains, strict=True)])
     confirmation = Confirmation(engine, other.score, other.scores, other.errors,
                                 float(apart.mean()), float(apart.max()))
-    found = disagreements([trial.name for trial in result.trials], result.chains, chains, best.scores,
-                          other.scores)
+    differences = disagreements([trial.name for trial in result.trials], result.chains, chains,
+                                best.scores, other.scores)
     warnings = result.warnings
-    if found:
-        warnings += f'engine {engine} disagrees with engine {result.engine}: {"; ".join(found)}',
+    if differences:
+        warnings += f'engine {engine} disagrees with engine {result.engine}: {"; ".join(differences)}',
     return replace(result, confirmation=confirmation, warnings=warnings)
 
 
 def sliced(result: CalibrationResult, options: Options, make_simulator: SimulatorFactory,
            should_stop: Callable[[], bool] = lambda: False) -> Slices | None:
     """
-    Simulate slices around a result, on as many threads as `options` say; None if the engine fails.
+    Simulate slices around a result; return None if the engine fails.
 
-    The time for them is limited, so that they may be coarse: see `slices.simulate_slices`.
+    Their time is limited, so they may be coarse: see `slices.simulate_slices`.
     """
     try:
         with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:

@@ -2,19 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Document: all that a person said about photographs of a DLO: scales, clicks, and what the hands did.
+Document: all that a person entered about photographs of a DLO: scales, clicks, and the steps of the hands.
 
 It is plain JSON, which the page edits.  `Document.of` checks it, as it may come from a stranger.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 import re
-from typing import Any, Mapping, Union
+from typing import Any, Callable, Mapping, Union
 
-from dlo_calibration.capture.plain_values import Entry, REMEDY, Values
-from dlo_calibration.capture.steps import LARGEST_PLACE, Step
+from dlo_calibration.capture.hands import LARGEST_PLACE, StepEntry
+from dlo_calibration.capture.json_values import entry_field, JsonValue, plain, REMEDY
 from dlo_calibration.errors import InputError
 
 VERSION = 1
@@ -29,6 +30,34 @@ ID = re.compile('[a-z0-9]{8}')
 Pixel = tuple[float, ...]  # u, v
 
 
+def _refused(where: str, came: str, expected: str) -> InputError:
+    return InputError(where, came, expected, REMEDY)
+
+
+def _pixel(entry: JsonValue) -> Pixel:
+    return entry.numbers(2, -LARGEST_PIXEL, LARGEST_PIXEL)
+
+
+def _id(entry: JsonValue) -> str:
+    if not ID.fullmatch(entry.text(NAME_LENGTH)):
+        raise entry.refused(repr(entry.value), 'an id of 8 letters a to z and digits')
+    return str(entry.value)
+
+
+def _optional_id(entry: JsonValue) -> str | None:
+    return _id(entry) if entry.given else None
+
+
+def _each(noun: str, most: int, read: Callable[[JsonValue], Any]) -> Callable[[JsonValue], Any]:
+    """Return what reads a list, of which each entry is called by a noun."""
+    return lambda entry: tuple(map(read, entry.entries(0, most, noun)))
+
+
+def _kind(name: str) -> Any:
+    """Declare the field that tells which kind of scale an object is."""
+    return entry_field(lambda entry: entry.choice([name]), name, init=False)
+
+
 @dataclass(frozen=True)
 class Dlo:
     """
@@ -39,9 +68,10 @@ class Dlo:
     :param points: of its chain.
     """
 
-    diameter: float | None = None
-    mass: float = 0.0
-    points: int = 21
+    diameter: float | None = entry_field(
+        lambda entry: entry.number(2e-4, 0.2) if entry.given else None, None)
+    mass: float = entry_field(lambda entry: entry.number(0.0, 1000.0), 0.0)
+    points: int = entry_field(lambda entry: entry.whole(5, 200), 21)
 
 
 @dataclass(frozen=True)
@@ -52,70 +82,67 @@ class BoardScale:
     :param ruler: measured length of its ruler line [m].
     """
 
-    ruler: float = 0.1
+    kind: str = _kind('board')
+    ruler: float = entry_field(lambda entry: entry.number(0.05, 0.2), 0.1)
 
-    def plain(self) -> dict[str, Any]:
-        """Return it as a document has it."""
-        return {'kind': 'board', 'ruler': self.ruler}
+
+@dataclass(frozen=True)
+class KnownPoint:
+    """A pixel u, v and its place x, y on the table [m]."""
+
+    pixel: Pixel = entry_field(_pixel)
+    table: Pixel = entry_field(lambda entry: entry.numbers(2, -LARGEST_PLACE, LARGEST_PLACE))
 
 
 @dataclass(frozen=True)
 class PointsScale:
-    """
-    Known points on the table.
+    """Known points on the table."""
 
-    :param points: pairs of a pixel u, v and its place x, y on the table [m].
-    """
-
-    points: tuple[tuple[Pixel, Pixel], ...]
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as a document has it."""
-        return {'kind': 'points', 'points': [{'pixel': list(pixel), 'table': list(table)}
-                                             for pixel, table in self.points]}
+    kind: str = _kind('points')
+    points: tuple[KnownPoint, ...] = entry_field(
+        _each('point', MOST_CLICKS, lambda entry: entry.record(KnownPoint)), ())
 
 
 @dataclass(frozen=True)
 class SameScale:
     """The camera did not move since another photograph, given by its id."""
 
-    photograph: str
+    kind: str = _kind('same')
+    photograph: str = entry_field(_id)
 
-    def plain(self) -> dict[str, Any]:
-        """Return it as a document has it."""
-        return {'kind': 'same', 'photograph': self.photograph}
+
+ScaleEntry = Union[BoardScale, PointsScale, SameScale]
+SCALES: Mapping[str, type[ScaleEntry]] = {'board': BoardScale, 'points': PointsScale, 'same': SameScale}
+
+
+def _scale(entry: JsonValue) -> ScaleEntry | None:
+    return entry.record(SCALES[entry.entry('kind').choice(tuple(SCALES))]) if entry.given else None
 
 
 @dataclass(frozen=True)
 class Answer:
     """A person's answer, which strand is above at the crossing near a pixel: the first or the second."""
 
-    pixel: Pixel
-    first_above: bool
+    pixel: Pixel = entry_field(_pixel)
+    first_above: bool = entry_field(JsonValue.truth)
 
 
 @dataclass(frozen=True)
 class PhotographEntry:
     """
-    What was said about a photograph.
+    What the person entered about a photograph.
 
     :param id: names its file.
     :param name: as the person knows it.
     :param clicks: (u, v) along the DLO, in order.
     """
 
-    id: str
-    name: str = ''
-    scale: Union[BoardScale, PointsScale, SameScale, None] = None
-    clicks: tuple[Pixel, ...] = ()
-    crossings: tuple[Answer, ...] = ()
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as a document has it."""
-        return {'id': self.id, 'name': self.name, 'scale': self.scale and self.scale.plain(),
-                'clicks': [list(click) for click in self.clicks],
-                'crossings': [{'pixel': list(one.pixel), 'first_above': one.first_above}
-                              for one in self.crossings]}
+    id: str = entry_field(_id)
+    name: str = entry_field(lambda entry: entry.text(NAME_LENGTH), '')
+    scale: ScaleEntry | None = entry_field(_scale, None)
+    clicks: tuple[Pixel, ...] = entry_field(_each('click', MOST_CLICKS, _pixel), ())
+    crossings: tuple[Answer, ...] = entry_field(
+        _each('crossing', MOST_CLICKS, lambda entry: entry.record(Answer)), ())
 
 
 @dataclass(frozen=True)
@@ -127,64 +154,56 @@ class TrialEntry:
     :param start_side: a second photograph of the start, from the side; likewise `goal_side`.
     """
 
-    start: str
-    goal: str | None = None
-    start_side: str | None = None
-    goal_side: str | None = None
-    steps: tuple[Step, ...] = ()
+    start: str = entry_field(_id)
+    goal: str | None = entry_field(_optional_id, None)
+    start_side: str | None = entry_field(_optional_id, None)
+    goal_side: str | None = entry_field(_optional_id, None)
+    steps: tuple[StepEntry, ...] = entry_field(_each('step', MOST_STEPS, StepEntry.of), ())
 
     @property
     def photographs(self) -> tuple[str, ...]:
         """The ids of all its photographs."""
         ids = (self.start, self.goal, self.start_side, self.goal_side)
-        return tuple(one for one in ids if one is not None)
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as a document has it."""
-        return {'start': self.start, 'goal': self.goal, 'start_side': self.start_side,
-                'goal_side': self.goal_side, 'steps': [step.plain() for step in self.steps]}
+        return tuple(identity for identity in ids if identity is not None)
 
 
 @dataclass(frozen=True)
 class Document:
-    """All that a person said."""
+    """All that a person entered."""
 
-    dlo: Dlo = Dlo()
-    photographs: tuple[PhotographEntry, ...] = ()
-    trials: tuple[TrialEntry, ...] = ()
-    by_id: Mapping[str, PhotographEntry] = field(init=False, repr=False, compare=False)
+    version: int = entry_field(lambda entry: entry.whole(VERSION, VERSION), VERSION, init=False)
+    dlo: Dlo = entry_field(lambda entry: entry.record(Dlo), Dlo())
+    photographs: tuple[PhotographEntry, ...] = entry_field(
+        _each('photograph', MOST_PHOTOGRAPHS, lambda entry: entry.record(PhotographEntry)), ())
+    trials: tuple[TrialEntry, ...] = entry_field(
+        _each('trial', MOST_TRIALS, lambda entry: entry.record(TrialEntry)), ())
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'by_id', {one.id: one for one in self.photographs})
         if len(self.by_id) < len(self.photographs):
             raise _refused('photographs', 'one id twice', 'an id of its own for each')
         for number, trial in enumerate(self.trials, start=1):
-            for one in trial.photographs:
-                self._require(one, f'trial {number}')
+            for identity in trial.photographs:
+                self._require(identity, f'trial {number}')
         for number, photograph in enumerate(self.photographs, start=1):
             self._check_scale(photograph, f'photograph {number}')
 
+    @cached_property
+    def by_id(self) -> Mapping[str, PhotographEntry]:
+        """The photographs by their ids."""
+        return {photograph.id: photograph for photograph in self.photographs}
+
     @classmethod
-    def of(cls, plain: Any) -> Document:
+    def of(cls, given: Any) -> Document:
         """
         Return the document of plain values; what is not given has its default.
 
         :raises InputError: where something is wrong; the text says where.
         """
-        values = Entry('document', plain).values('version', 'dlo', 'photographs', 'trials')
-        values = Values('', values.content)
-        values.entry('version', VERSION).whole(VERSION, VERSION)
-        photographs = values.each('photographs', 'photograph', MOST_PHOTOGRAPHS)
-        trials = values.each('trials', 'trial', MOST_TRIALS)
-        return cls(_dlo(values.entry('dlo', {})), tuple(map(_photograph, photographs)),
-                   tuple(map(_trial, trials)))
+        return JsonValue('', given).record(cls)
 
     def plain(self) -> dict[str, Any]:
         """Return the document as plain values, with all defaults."""
-        return {'version': VERSION, 'dlo': {'diameter': self.dlo.diameter, 'mass': self.dlo.mass,
-                                            'points': self.dlo.points},
-                'photographs': [one.plain() for one in self.photographs],
-                'trials': [one.plain() for one in self.trials]}
+        return dict(plain(self))
 
     def with_photograph(self, entry: PhotographEntry) -> Document:
         """
@@ -211,9 +230,9 @@ class Document:
             photograph = self.by_id[photograph.scale.photograph]
         return photograph
 
-    def _require(self, one: str, where: str) -> None:
-        if one not in self.by_id:
-            raise _refused(where, f'a photograph {one!r} that is not there', 'the id of a photograph')
+    def _require(self, identity: str, where: str) -> None:
+        if identity not in self.by_id:
+            raise _refused(where, f'a photograph {identity!r} that is not there', 'the id of a photograph')
 
     def _check_scale(self, photograph: PhotographEntry, where: str) -> None:
         seen = {photograph.id}
@@ -224,67 +243,3 @@ class Document:
                                'one of them with a board or points')
             photograph = self.by_id[photograph.scale.photograph]
             seen.add(photograph.id)
-
-
-def _refused(where: str, came: str, expected: str) -> InputError:
-    return InputError(where, came, expected, REMEDY)
-
-
-def _dlo(entry: Entry) -> Dlo:
-    values = entry.values('diameter', 'mass', 'points')
-    diameter = values.entry('diameter')
-    return Dlo(diameter.number(2e-4, 0.2) if diameter.given else None,
-               values.entry('mass', 0.0).number(0.0, 1000.0), values.entry('points', 21).whole(5, 200))
-
-
-def _pixel(entry: Entry) -> Pixel:
-    return entry.numbers(2, -LARGEST_PIXEL, LARGEST_PIXEL)
-
-
-def _id(entry: Entry) -> str:
-    if not ID.fullmatch(entry.text(NAME_LENGTH)):
-        raise entry.refused(repr(entry.value), 'an id of 8 letters a to z and digits')
-    return str(entry.value)
-
-
-def _optional_id(entry: Entry) -> str | None:
-    return _id(entry) if entry.given else None
-
-
-def _photograph(entry: Entry) -> PhotographEntry:
-    values = entry.values('id', 'name', 'scale', 'clicks', 'crossings')
-    answers = []
-    for one in values.each('crossings', 'crossing', MOST_CLICKS):
-        answer = one.values('pixel', 'first_above')
-        answers.append(Answer(_pixel(answer.entry('pixel')), answer.entry('first_above').truth()))
-    scale = values.entry('scale')
-    return PhotographEntry(
-        _id(values.entry('id')), values.entry('name', '').text(NAME_LENGTH),
-        _scale(scale) if scale.given else None,
-        tuple(map(_pixel, values.each('clicks', 'click', MOST_CLICKS))), tuple(answers))
-
-
-def _scale(entry: Entry) -> Union[BoardScale, PointsScale, SameScale]:
-    values = entry.values()
-    kind = values.entry('kind').choice(('board', 'points', 'same'))
-    if kind == 'board':
-        values.only('kind', 'ruler')
-        return BoardScale(values.entry('ruler', 0.1).number(0.05, 0.2))
-    if kind == 'same':
-        values.only('kind', 'photograph')
-        return SameScale(_id(values.entry('photograph')))
-    values.only('kind', 'points')
-    points = []
-    for one in values.each('points', 'point', MOST_CLICKS):
-        point = one.values('pixel', 'table')
-        points.append((_pixel(point.entry('pixel')),
-                       point.entry('table').numbers(2, -LARGEST_PLACE, LARGEST_PLACE)))
-    return PointsScale(tuple(points))
-
-
-def _trial(entry: Entry) -> TrialEntry:
-    values = entry.values('start', 'goal', 'start_side', 'goal_side', 'steps')
-    steps = [Step.of(one.values()) for one in values.each('steps', 'step', MOST_STEPS)]
-    goal, start_side, goal_side = (_optional_id(values.entry(name))
-                                   for name in ('goal', 'start_side', 'goal_side'))
-    return TrialEntry(_id(values.entry('start')), goal, start_side, goal_side, tuple(steps))

@@ -1,24 +1,213 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hands: from the steps that a person named, and the chains before and after, to the paths of the hands."""
+"""
+Hands: the steps that a person enters, and the paths of the hands that they mean.
+
+Most kinds of steps are named actions (`dlo_calibration.model.named_actions`); `path` is a way that the person
+drew.  The chains before and after give the places where the hands close and open.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Callable, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.capture.steps import Hold, Step
+from dlo_calibration.capture.json_values import JsonValue, plain
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Action, Hand
+from dlo_calibration.model.action import Action, Hand, MAXIMUM_HANDS
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, PushDown, TwoHands
+from dlo_calibration.model.named_actions import NAMED_ACTIONS
 
-PAUSE = 1.0  # s between steps, and before the goal: the DLO comes to rest, as a person waits for it
+PAUSE = 1.0  # s between steps, and before the goal: people wait until the DLO is at rest
 RAISED = 0.005  # m; a hand that is higher above its point's place on the table holds it in the air
 BESIDE = 0.02  # m; a target that is so near to the goal's point is meant to be this point
+NAME_LENGTH = 40  # characters of a hand's name
+MOST_WAYPOINTS = 50  # of a drawn way
+LARGEST_PLACE = 100.0  # m from the origin of the table's frame
+
+
+@dataclass(frozen=True)
+class Field:
+    """
+    One field of a step.
+
+    :param default: its value where the document does not give one.
+    :param form: what it is: `number`, `truth`, `choice`, `name`, `names`, `numbers`, `place`, `waypoints`.
+    :param choices: the values that a `choice` has.
+    """
+
+    default: Any
+    form: str = 'number'
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+def _waypoint(entry: JsonValue) -> tuple[float, ...]:
+    x, y, height = entry.numbers(3, -LARGEST_PLACE, LARGEST_PLACE)
+    if height < 0:
+        raise entry.refused(f'a height of {height:g} m', '0 or more')
+    return x, y, height
+
+
+#: Form of a field -> what returns the value of an entry, checked.
+READERS: Mapping[str, Callable[[Field, JsonValue], Any]] = {
+    'number': lambda field, entry: entry.number(field.minimum or 0.0, field.maximum or 0.0),
+    'truth': lambda _, entry: entry.truth(),
+    'choice': lambda field, entry: entry.choice(field.choices),
+    'name': lambda _, entry: entry.word(NAME_LENGTH),
+    'names': lambda _, entry: tuple(name.word(NAME_LENGTH) for name in entry.entries(1, MAXIMUM_HANDS)),
+    'numbers': lambda field, entry: entry.numbers(2, field.minimum or 0.0, field.maximum or 0.0),
+    'place': lambda _, entry: entry.numbers(2, -LARGEST_PLACE, LARGEST_PLACE) if entry.given else None,
+    'waypoints': lambda _, entry: tuple(map(_waypoint, entry.entries(0, MOST_WAYPOINTS))),
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """
+    A kind of step.
+
+    :param text: which parameters it shows, for the person who chooses.
+    """
+
+    title: str
+    text: str
+    fields: Mapping[str, Field]
+
+
+_HAND = {'hand': Field('left_hand', 'name'), 'fraction': Field(0.5, unit='', minimum=0.0, maximum=1.0)}
+_TO = Field(None, 'place', 'm')
+_SPEED = Field(0.1, unit='m/s', minimum=0.001, maximum=10.0)
+
+
+def _length(default: float, least: float = 0.0) -> Field:
+    return Field(default, unit='m', minimum=least, maximum=5.0)
+
+
+def _hold(default: bool) -> Field:
+    return Field(default, 'truth')
+
+
+KINDS: Mapping[str, Kind] = {
+    'grasp_and_place': Kind(
+        'Grasp and place', 'The hand lifts a point, carries it and puts it down. It shows some of the '
+        'bending stiffness and the friction.',
+        {**_HAND, 'to': _TO, 'height': _length(0.05, 0.001), 'speed': _SPEED, 'hold': _hold(False)}),
+    'drag': Kind(
+        'Drag', 'The hand pulls a point along the table. It shows much of the bending stiffness and the '
+        'friction.', {**_HAND, 'to': _TO, 'speed': _SPEED, 'hold': _hold(False)}),
+    'lift_and_hold': Kind(
+        'Lift and hold', 'The hand lifts a point straight up and holds it there. It shows the bending '
+        'stiffness best, and needs a second photograph from the side.',
+        {**_HAND, 'height': _length(0.1, 0.001), 'speed': _SPEED, 'hold': _hold(True)}),
+    'push_down': Kind(
+        'Push down', 'The hand pushes a raised point down and holds it there. It shows much of the bending '
+        'stiffness, and needs a second photograph from the side.',
+        {**_HAND, 'distance': _length(0.05, 0.001), 'speed': _SPEED, 'hold': _hold(True)}),
+    'two_hands': Kind(
+        'Two hands', 'Two hands move apart or together. Apart, it is the only one that shows how the DLO '
+        'stretches; together, it shows how it bends.',
+        {'hands': Field(('left_hand', 'right_hand'), 'names'),
+         'fractions': Field((0.25, 0.75), 'numbers', minimum=0.0, maximum=1.0),
+         'motion': Field('together', 'choice', choices=('together', 'apart')),
+         'distance': _length(0.1, 0.001),
+         'moving': Field('both', 'choice', choices=('both', 'first', 'second')), 'height': _length(0.0),
+         'speed': _SPEED, 'hold': _hold(True)}),
+    'path': Kind(
+        'Along a drawn way', 'The hand carries a point along the places that are drawn, each at a height. '
+        'What it shows depends on the way.',
+        {**_HAND, 'waypoints': Field((), 'waypoints', 'm'), 'speed': _SPEED, 'hold': _hold(False)}),
+    'release': Kind(
+        'Release', 'A hand that still holds the DLO opens where it is. After a lift, it shows the bends that '
+        'remain.', {'hands': Field(('left_hand',), 'names')}),
+}
+
+
+@dataclass(frozen=True)
+class StepEntry:
+    """
+    A movement of one hand, or of two together.
+
+    :param kind: one of `KINDS`.
+    :param values: all fields of the kind, by name.
+    :param with_previous: True: it begins with the step before it; False: after all before it have ended.
+    """
+
+    kind: str
+    values: Mapping[str, Any]
+    with_previous: bool = False
+
+    @classmethod
+    def of(cls, values: JsonValue) -> StepEntry:
+        """Return the step of a document; what is not given has its default."""
+        kind = values.entry('kind').choice(tuple(KINDS))
+        fields = KINDS[kind].fields
+        values.only('kind', 'with_previous', *fields)
+        read = {name: READERS[field.form](field, values.entry(name, field.default))
+                for name, field in fields.items()}
+        return cls(kind, read, values.entry('with_previous', False).truth())
+
+    @property
+    def hands(self) -> tuple[str, ...]:
+        """The names of the hands that it moves or opens."""
+        names: tuple[str, ...] = self.values.get('hands') or (self.values['hand'],)
+        return names
+
+    @property
+    def fractions(self) -> tuple[float, ...]:
+        """Where the hands grip, each as a fraction of the length; none where they hold it already."""
+        if 'fraction' in self.values:
+            return (self.values['fraction'],)
+        return tuple(self.values.get('fractions', ()))
+
+    @property
+    def json_entries(self) -> dict[str, Any]:
+        """The step as a document has it."""
+        return {'kind': self.kind, **self.values, 'with_previous': self.with_previous}
+
+
+@dataclass(frozen=True)
+class Hold:
+    """
+    A hand that holds the DLO.
+
+    :param fraction: of the length, where it grips.
+    :param raised: whether it holds that point in the air.
+    """
+
+    hand: str
+    fraction: float
+    raised: bool = False
+
+
+def held_after(steps: Sequence[StepEntry], before: Sequence[Hold] = ()) -> tuple[Hold, ...]:
+    """Return which hands hold the DLO after some steps, if those in `before` hold it at first."""
+    held = {hold.hand: hold for hold in before}
+    for step in steps:
+        for name in step.hands:
+            held.pop(name, None)
+        if step.values.get('hold'):
+            held.update({name: Hold(name, fraction, _raises(step))
+                         for name, fraction in zip(step.hands, step.fractions, strict=False)})
+    return tuple(held.values())
+
+
+def _raises(step: StepEntry) -> bool:
+    """Tell whether a step ends with its point in the air."""
+    if step.kind == 'path':
+        return bool(step.values['waypoints']) and step.values['waypoints'][-1][2] > 0
+    return step.kind in ('lift_and_hold', 'push_down') or (
+        step.kind == 'two_hands' and step.values['height'] > 0)
+
+
+def described() -> list[dict[str, Any]]:
+    """Return all kinds of steps as plain values, for the page."""
+    return [{'kind': name, **plain(kind)} for name, kind in KINDS.items()]
 
 
 @dataclass
@@ -71,26 +260,19 @@ class Movements:
 
 
 @dataclass
-class _Course:
-    start: Chain
+class _Paths:
+    """The paths of the hands of a trial, while the steps are performed."""
+
+    known: Floats  # (n, 3) places of the chain's points, as far as they are known [m]
     goal: Chain
     radius: float
     measured_height: bool
-    known: Floats = field(init=False)
     moved: set[int] = field(default_factory=set)  # points whose place is known from an earlier step
     held: dict[str, _Path] = field(default_factory=dict)
     paths: list[_Path] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self.known = self.start.points.copy()
-
-    def hold(self, name: str, grip: int) -> None:
-        """Let a hand hold a point from the beginning."""
-        self.held[name] = _Path(name, grip, [0.0], [self.known[grip]])
-        self.paths.append(self.held[name])
-
-    def conduct(self, step: Step, grips: Sequence[int], begin: float) -> float:
-        """Let hands take a step; return when it ends [s]."""
+    def perform(self, step: StepEntry, grips: Sequence[int], begin: float) -> float:
+        """Perform a step; return when it ends [s]."""
         if step.kind == 'release':
             return self._release(step.hands, begin)
         if len(set(grips)) < len(grips):
@@ -131,27 +313,21 @@ class _Course:
             self.held.pop(name).rest_until(begin)
         return begin
 
-    def _ways(self, step: Step, grips: Sequence[int]) -> list[tuple[Floats, Floats]]:
+    def _ways(self, step: StepEntry, grips: Sequence[int]) -> list[tuple[Floats, Floats]]:
         """Return the times (k,) [s] from the beginning of a step, and positions (k, 3) [m], of each hand."""
-        values, here = step.values, Chain(self.known)
-        if step.kind == 'two_hands':
-            given = {name: value for name, value in values.items() if name != 'fractions'}
-            return _of(TwoHands(points=tuple(grips), **given).action(here))
-        grip, speed = grips[0], values['speed']
+        values, grip, speed = step.values, grips[0], step.values['speed']
         if step.kind == 'path':
             places = [self.known[grip], *(np.array([x, y, self.radius + height])
                                           for x, y, height in values['waypoints'])]
             return [_along(places, speed)]
         if step.kind in ('lift_and_hold', 'push_down') and self.measured_height and values['hold']:
             return [_along([self.known[grip], self.goal.points[grip]], speed)]
-        if step.kind == 'lift_and_hold':
-            return _of(LiftAndHold(point=grip, height=values['height'], speed=speed).action(here))
-        if step.kind == 'push_down':
-            return _of(PushDown(point=grip, distance=values['distance'], speed=speed).action(here))
-        target = tuple(self._target(grip, values['to']).tolist())
-        if step.kind == 'drag':
-            return _of(Drag(point=grip, to=target, speed=speed).action(here))
-        return _of(GraspAndPlace(point=grip, to=target, height=values['height'], speed=speed).action(here))
+        given = {name: value for name, value in values.items() if name not in ('fraction', 'fractions')}
+        if 'to' in given:
+            given['to'] = tuple(self._target(grip, given['to']).tolist())
+        gripped = {'points': tuple(grips)} if step.kind == 'two_hands' else {'point': grip}
+        action = NAMED_ACTIONS[step.kind](**gripped, **given).action(Chain(self.known))
+        return [(hand.times, hand.positions) for hand in action.hands]
 
     def _target(self, grip: int, to: tuple[float, ...] | None) -> Floats:
         """Return where a hand lets a point go, (3,) [m]."""
@@ -162,8 +338,8 @@ class _Course:
         return np.array([*to, seen[2] if near else self.radius])
 
 
-def movements(steps: Sequence[Step], start: Chain, goal: Chain, grip_of: Callable[[float], int],
-              radius: float, measured_height: bool = False, held: Sequence[Hold] = ()) -> Movements:
+def move(steps: Sequence[StepEntry], start: Chain, goal: Chain, grip_of: Callable[[float], int],
+         radius: float, measured_height: bool = False, held: Sequence[Hold] = ()) -> Movements:
     """
     Return the paths of the hands.
 
@@ -176,28 +352,26 @@ def movements(steps: Sequence[Step], start: Chain, goal: Chain, grip_of: Callabl
     :param held: the hands that hold the DLO at the start.
     :raises InputError: where the steps contradict each other; its thing begins with the step's number.
     """
-    course = _Course(start, goal, radius, measured_height)
-    for one in held:
-        course.hold(one.hand, grip_of(one.fraction))
+    paths = _Paths(start.points.copy(), goal, radius, measured_height)
+    for hold in held:
+        grip = grip_of(hold.fraction)
+        paths.held[hold.hand] = _Path(hold.hand, grip, [0.0], [start.points[grip]])
+        paths.paths.append(paths.held[hold.hand])
     begin, end, unknown = 0.0, -PAUSE, []
     for number, step in enumerate(steps, start=1):
         if number == 1 or not step.with_previous:
             begin = end + PAUSE
         grips = [grip_of(fraction) for fraction in step.fractions]
-        if course.moved and step.kind != 'release' and not step.with_previous and not (
-                set(grips) <= course.moved):
+        if paths.moved and step.kind != 'release' and not step.with_previous and not (
+                set(grips) <= paths.moved):
             unknown.append(number)
         try:
-            end = max(end, course.conduct(step, grips, begin))
+            end = max(end, paths.perform(step, grips, begin))
         except InputError as error:
             raise InputError(f'step {number}, {error.thing}', error.came, error.expected,
                              error.remedy) from error
-    hands = tuple(path.hand() for path in course.paths)
-    return Movements(hands, tuple(course.held), max(end, 0.0), tuple(unknown))
-
-
-def _of(action: Action) -> list[tuple[Floats, Floats]]:
-    return [(hand.times, hand.positions) for hand in action.hands]
+    hands = tuple(path.hand() for path in paths.paths)
+    return Movements(hands, tuple(paths.held), max(end, 0.0), tuple(unknown))
 
 
 def _along(places: Sequence[Floats], speed: float) -> tuple[Floats, Floats]:
@@ -206,5 +380,5 @@ def _along(places: Sequence[Floats], speed: float) -> tuple[Floats, Floats]:
     for place in places[1:]:
         if np.linalg.norm(place - way[-1]) > 1e-6:  # m
             way.append(place)
-    lengths = np.linalg.norm(np.diff(way, axis=0), axis=1) if len(way) > 1 else np.zeros(0)
-    return np.concatenate([[0.0], np.cumsum(lengths / speed)]), np.array(way)
+    lengths = np.linalg.norm(np.diff(way, axis=0, prepend=way[:1]), axis=1)
+    return np.cumsum(lengths / speed), np.array(way)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Project: a folder that keeps all that a person did, to be opened again.
+Project: a folder with all that a person entered, which can be opened again.
 
 It holds `project.json` (the document), the photographs as they came, each named by its id, and `lens.yaml`.
 Photographs that the document no longer has keep their files, so that removing one can be undone.
@@ -10,9 +10,10 @@ Photographs that the document no longer has keep their files, so that removing o
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from contextlib import suppress
 import fcntl
+from functools import lru_cache
+from itertools import count
 import json
 import os
 from pathlib import Path
@@ -22,17 +23,21 @@ import string
 from threading import Lock
 from typing import Any
 
-from dlo_calibration.capture.camera import Lens, read_lens
 from dlo_calibration.capture.document import BoardScale, Document, ID, NAME_LENGTH, PhotographEntry, SameScale
-from dlo_calibration.capture.photograph import Photograph, read_photograph
-from dlo_calibration.errors import InputError, shortened, told, unwritable
-from dlo_calibration.writing import make_folder, whole
+from dlo_calibration.capture.json_values import parsed
+from dlo_calibration.errors import InputError, safe_line, shortened, unwritable
+from dlo_calibration.reading import read_octets
+from dlo_calibration.vision.camera import Lens, read_lens
+from dlo_calibration.vision.photograph import Photograph, read_photograph
+from dlo_calibration.workspace.folder import REQUEST, SESSION
+from dlo_calibration.writing import make_folder, whole, write_file
 
-DOCUMENT, LENS, PHOTOGRAPHS, LOCK = 'project.json', 'lens.yaml', 'photographs', '.lock'
+DOCUMENT, LENS, LOCK = 'project.json', 'lens.yaml', '.lock'
+PHOTOGRAPHS, CALIBRATION = 'photographs', 'result'  # folders in it
 MOST_OCTETS = 4 * 2**20  # of the document; a full one has 2 MB
 MOST_FILES = 400  # photographs, also those that were removed
 MOST_OCTETS_OF_ALL = 4 * 2**30  # of these
-LENS_OCTETS = 2**20
+LENS_OCTETS = 2**20  # of a camera calibration
 IN_MEMORY = 3  # decoded photographs; one of 12 megapixels takes 36 MB
 SUFFIXES = {b'\xff\xd8\xff': '.jpg', b'\x89PN': '.png'}  # first bytes of a file -> its suffix
 
@@ -45,19 +50,20 @@ class Project:
     """
     A folder with a document and its photographs.
 
-    :param document: what the person said.
+    :param document: what the person entered.
     :param revision: of the document; it grows with each change.
     :raises InputError: where the folder cannot be used, or another process uses it.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        _refuse_links(folder)
         make_folder(folder / PHOTOGRAPHS)
         self._lock = _locked(folder)
-        self._problems: list[str] = []
+        self.problems: list[str] = []  # warnings about what was wrong in the folder when it was opened
         self.revision = 1
-        self._decoded: OrderedDict[str, Photograph] = OrderedDict()
-        self._reading = Lock()
+        self._decoded = lru_cache(IN_MEMORY)(self._read)
+        self._decoding = Lock()
         self.document = self._opened()
         self.lens: Lens | None = None
         self.lens_name: str | None = None
@@ -65,12 +71,7 @@ class Project:
             try:
                 self.lens, self.lens_name = read_lens(folder / LENS), LENS
             except InputError as error:
-                self._problems.append(f'The camera calibration in the folder is not used: {error}')
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """Sentences about what was wrong in the folder when it was opened."""
-        return tuple(self._problems)
+                self.problems.append(f'The camera calibration in the folder is not used: {error}')
 
     def close(self) -> None:
         """Let other processes use the folder."""
@@ -78,7 +79,7 @@ class Project:
 
     def change(self, document: Document, revision: int) -> None:
         """
-        Keep a document in place of the present one.
+        Save a document in place of the present one.
 
         :param revision: of the document that was changed.
         :raises OldRevision: where another change came first.
@@ -87,61 +88,57 @@ class Project:
         if revision != self.revision:
             raise OldRevision('document', f'a change of revision {revision}', f'revision {self.revision}',
                               'repeat the change; another window changed the document')
-        for one in document.photographs:
-            self.path(one.id)
-        with whole(self.folder / DOCUMENT) as new:
-            new.write_text(json.dumps(document.plain(), indent=1, allow_nan=False), encoding='utf-8')
+        for photograph in document.photographs:
+            self.path(photograph.id)
+        write_file(self.folder / DOCUMENT, json.dumps(document.plain(), indent=1, allow_nan=False))
         self.document, self.revision = document, self.revision + 1
 
     def add_photograph(self, octets: bytes, name: str) -> str:
         """
-        Keep a photograph, put it into the document, and return its id.
+        Save a photograph, add it to the document, and return its id.
 
-        Where the photograph before it has the board, or is that of a camera that does not move, it has too.
+        Its scale is the kind of the photograph before: the board, or the same scale while the camera stays.
 
         :param octets: content of the file.
         :param name: of the file, as the person knows it; it is only shown.
         :raises InputError: where it is no photograph, or is one too many.
         """
-        name = shortened(told(name), NAME_LENGTH) or 'photograph'
+        name = shortened(safe_line(name), NAME_LENGTH) or 'photograph'
         photograph = read_photograph(octets, f'photograph {name}')
-        files = [one for one in (self.folder / PHOTOGRAPHS).iterdir() if not one.name.startswith('.')]
-        if len(files) >= MOST_FILES or sum(one.lstat().st_size for one in files) > MOST_OCTETS_OF_ALL:
+        files = [path for path in (self.folder / PHOTOGRAPHS).iterdir() if not path.name.startswith('.')]
+        if len(files) >= MOST_FILES or sum(path.lstat().st_size for path in files) > MOST_OCTETS_OF_ALL:
             raise InputError(f'folder {self.folder}', f'{len(files)} photographs', 'fewer',
                              'go on in another folder')
-        one = ''.join(secrets.choice(string.ascii_lowercase + string.digits) for _ in range(8))
-        document = self.document.with_photograph(PhotographEntry(one, name, self._next_scale(photograph)))
-        with whole(self.folder / PHOTOGRAPHS / f'{one}{SUFFIXES[octets[:3]]}') as new:
-            new.write_bytes(octets)
-        with self._reading:
-            self._keep(one, photograph)
+        identity = ''.join(secrets.choice(string.ascii_lowercase + string.digits) for _ in range(8))
+        entry = PhotographEntry(identity, name, self._next_scale(photograph))
+        document = self.document.with_photograph(entry)
+        write_file(self.folder / PHOTOGRAPHS / f'{identity}{SUFFIXES[octets[:3]]}', octets)
         self.change(document, self.revision)
-        return one
+        return identity
 
-    def path(self, one: str) -> Path:
+    def path(self, identity: str) -> Path:
         """Return the file of a photograph, given by its id."""
-        if ID.fullmatch(one):
+        if ID.fullmatch(identity):
             for suffix in SUFFIXES.values():
-                path = self.folder / PHOTOGRAPHS / f'{one}{suffix}'
+                path = self.folder / PHOTOGRAPHS / f'{identity}{suffix}'
                 with suppress(OSError):
                     if stat.S_ISREG(path.lstat().st_mode):  # a link could lead anywhere
                         return path
-        raise InputError(f'photograph {one}', 'no file in the folder of the project', 'its photograph',
+        raise InputError(f'photograph {identity}', 'no file in the folder of the project', 'its photograph',
                          'add it again')
 
-    def photograph(self, one: str) -> Photograph:
+    def photograph(self, identity: str) -> Photograph:
         """
         Return a photograph, given by its id; any thread may ask for it.
 
         :raises InputError: where it cannot be read.
         """
-        with self._reading:
-            found = self._decoded.get(one)
-            if found is None:
-                entry = self.document.by_id.get(one)
-                found = read_photograph(self.path(one), f'photograph {entry.name if entry else one}')
-            self._keep(one, found)
-            return found
+        with self._decoding:
+            return self._decoded(identity)
+
+    def _read(self, identity: str) -> Photograph:
+        entry = self.document.by_id.get(identity)
+        return read_photograph(self.path(identity), f'photograph {entry.name if entry else identity}')
 
     def set_lens(self, octets: bytes, name: str) -> None:
         """
@@ -152,16 +149,16 @@ class Project:
         :raises InputError: where it cannot be used; the one before is then kept.
         """
         if len(octets) > LENS_OCTETS:
-            raise InputError(f'camera calibration {told(name)}', f'more than {LENS_OCTETS} bytes',
+            raise InputError(f'camera calibration {safe_line(name)}', f'more than {LENS_OCTETS} bytes',
                              'the YAML file of a ROS camera calibration', 'check the file')
         with whole(self.folder / LENS) as new:
             new.write_bytes(octets)
             try:
                 lens = read_lens(new)
             except InputError as error:
-                raise InputError(f'camera calibration {told(name)}', error.came, error.expected,
+                raise InputError(f'camera calibration {safe_line(name)}', error.came, error.expected,
                                  error.remedy) from error
-        self.lens, self.lens_name = lens, shortened(told(name), NAME_LENGTH) or LENS
+        self.lens, self.lens_name = lens, shortened(safe_line(name), NAME_LENGTH) or LENS
 
     def remove_lens(self) -> None:
         """Use no camera calibration."""
@@ -172,64 +169,70 @@ class Project:
     def _opened(self) -> Document:
         """Return the document in the folder; an empty one where there is none that can be used."""
         path = self.folder / DOCUMENT
-        if not path.exists() and not path.is_symlink():
+        if not path.exists():
             return Document()
         try:
             document = Document.of(_json(path))
-            for one in document.photographs:
-                self.path(one.id)
+            for photograph in document.photographs:
+                self.path(photograph.id)
             return document
         except InputError as error:
             aside = _free_name(path)
             path.rename(aside)
-            self._problems.append(f'{DOCUMENT} could not be used and is now called {aside.name}; '
-                              f'the project begins anew. The reason: {error}')
+            self.problems.append(f'{DOCUMENT} could not be used and is now called {aside.name}; '
+                             f'the project begins anew. The reason: {error}')
             return Document()
 
     def _next_scale(self, photograph: Photograph) -> BoardScale | SameScale | None:
         """Return the scale that the next photograph probably has."""
-        last = self.document.photographs[-1:]
-        if not last or not isinstance(last[0].scale, (BoardScale, SameScale)):
-            return None
-        if isinstance(last[0].scale, SameScale):
+        scale = self.document.photographs[-1].scale if self.document.photographs else None
+        if isinstance(scale, SameScale):
             with suppress(InputError):
-                if self.photograph(last[0].scale.photograph).size == photograph.size:
-                    return last[0].scale
-            return None
-        return last[0].scale
+                return scale if self.photograph(scale.photograph).size == photograph.size else None
+        return scale if isinstance(scale, BoardScale) else None
 
-    def _keep(self, one: str, photograph: Photograph) -> None:
-        self._decoded[one] = photograph
-        self._decoded.move_to_end(one)
-        while len(self._decoded) > IN_MEMORY:
-            self._decoded.popitem(last=False)
+
+def _refuse_links(folder: Path) -> None:
+    """
+    Check that what a project reads and writes in its folder is there: regular files and folders.
+
+    A link could lead anywhere, and opening a FIFO never ends.
+
+    :raises InputError: for the first other thing.
+    """
+    own = [folder / name for name in (DOCUMENT, LENS, LOCK, PHOTOGRAPHS, CALIBRATION, SESSION, REQUEST)]
+    try:
+        while own:
+            path = own.pop()
+            with suppress(FileNotFoundError, NotADirectoryError):
+                mode = path.lstat().st_mode
+                if stat.S_ISDIR(mode):
+                    own += path.iterdir()
+                elif not stat.S_ISREG(mode):
+                    came = 'a link' if stat.S_ISLNK(mode) else 'something that is no file'
+                    raise InputError(f'{path}', came, 'the files of a project',
+                                     'remove it, or copy there what it leads to')
+    except OSError as error:
+        raise InputError(f'folder {folder}', error.strerror or str(error), 'a folder that can be read',
+                         'name another folder') from error
 
 
 def _json(path: Path) -> Any:
     """Return the plain values in a file, which may come from a stranger."""
     expected, remedy = 'the document of a project', 'restore it from a copy'
+    octets = read_octets(path, f'file {path}', expected, MOST_OCTETS)
+    if len(octets) > MOST_OCTETS:
+        raise InputError(f'file {path}', f'more than {MOST_OCTETS} bytes', expected, remedy)
     try:
-        if not stat.S_ISREG(path.lstat().st_mode):
-            raise InputError(f'file {path}', 'something that is no file', expected, remedy)
-        with path.open('rb') as stream:
-            octets = stream.read(MOST_OCTETS + 1)
-        if len(octets) > MOST_OCTETS:
-            raise InputError(f'file {path}', f'more than {MOST_OCTETS} bytes', expected, remedy)
-        return json.loads(octets.decode('utf-8'), parse_constant=_refuse_constant)
-    except (OSError, ValueError, RecursionError) as error:
+        return parsed(octets)
+    except (ValueError, RecursionError) as error:
         raise InputError(f'file {path}', f'no JSON document ({error})', expected, remedy) from error
-
-
-def _refuse_constant(text: str) -> Any:
-    raise ValueError(f'{text} is no number')
 
 
 def _free_name(path: Path) -> Path:
     """Return a name for a damaged file that no other file has."""
-    number = 1
-    while (aside := path.with_name(f'{path.stem}_damaged_{number}{path.suffix}')).exists():
-        number += 1
-    return aside
+    names = (path.with_name(f'{path.stem}_damaged_{number}{path.suffix}') for number in count(1))
+    return next(aside for aside in names if not aside.exists())
 
 
 def _locked(folder: Path) -> Any:

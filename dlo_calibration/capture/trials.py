@@ -1,190 +1,293 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trials: from the readings of a start and a goal photograph, and the steps of the hands, to a trial."""
+"""
+Trials: drafted from the measured photographs of a start and a goal, and the steps of the hands.
+
+What did not change since the last draft is not computed again.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Sequence
+from pathlib import Path
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.chains import Axis
+from dlo_calibration.calibration.options import Options, recordable
 from dlo_calibration.capture.document import TrialEntry
-from dlo_calibration.capture.hands import Movements, movements, PAUSE
-from dlo_calibration.capture.readings import numbers, Reading
-from dlo_calibration.capture.remarks import (
-    about_axes,
-    about_held,
-    about_movements,
-    about_photograph,
-    error,
-    Remark,
-)
-from dlo_calibration.capture.steps import Hold
-from dlo_calibration.capture.two_views import axis_of_two_views
+from dlo_calibration.capture.hands import held_after, Hold, move, Movements, PAUSE
+from dlo_calibration.capture.json_values import plain
+from dlo_calibration.capture.measurement import Measurement, Measurer, numbers
+from dlo_calibration.capture.project import Project
+from dlo_calibration.capture.trial_warnings import check_axes, check_hands, check_photograph, TrialWarnings
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.digest import digest
+from dlo_calibration.files.recording import write_records
+from dlo_calibration.files.request import Request, TrialRequest
+from dlo_calibration.files.request import write_request as write_document
+from dlo_calibration.files.session import trial_records
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.parameters import BY_NAME, SCALE
 from dlo_calibration.model.trial import Goal, Trial
 from dlo_calibration.simulation.nodes import spread_places
+from dlo_calibration.vision.axis import Axis
+from dlo_calibration.vision.two_views import axis_of_two_views
 
 SNAP = 0.25  # spacings of a chain: a hand that is so near to an end, or to another grip, is there
 
 
 @dataclass(frozen=True, eq=False)
-class ReadTrial:
+class TrialDraft:
     """
-    A trial as far as it can be read.
+    A trial as far as the document describes it.
 
     :param trial: as a session records it; None where something is missing or wrong.
-    :param remarks: what the person should know.
     :param lengths: of the DLO in the start and the goal [m]; None: not known.
-    :param hands: their paths.
+    :param movements: of the hands; None: not known.
     """
 
-    remarks: tuple[Remark, ...]
-    trial: Trial | None = None
+    warnings: TrialWarnings
+    start: Measurement | None = None
+    goal: Measurement | None = None
     lengths: tuple[float | None, float | None] = (None, None)
-    hands: tuple[Hand, ...] = ()
-    start: Reading | None = None
-    goal: Reading | None = None
-    opened: frozenset[str] = frozenset()
+    movements: Movements | None = None
+    trial: Trial | None = None
 
     @cached_property
     def plain(self) -> dict[str, Any]:
         """What the page draws, as plain values."""
-        return {'complete': self.trial is not None, 'remarks': [one.plain() for one in self.remarks],
+        hands = () if self.movements is None else self.movements.hands
+        return {'complete': self.trial is not None, 'remarks': plain(tuple(self.warnings.entries)),
                 'start_length': self.lengths[0], 'goal_length': self.lengths[1],
-                'hands': [self._plain_hand(hand) for hand in self.hands]}
+                'hands': [self._plain_hand(hand) for hand in hands]}
 
     def _plain_hand(self, hand: Hand) -> dict[str, Any]:
-        start, goal = (_pixels(one, hand.positions) for one in (self.start, self.goal))
+        assert self.movements is not None
+        start, goal = (_pixels(photograph, hand.positions) for photograph in (self.start, self.goal))
+        opens = hand.name not in self.movements.held_by
         return {'name': hand.name, 'start_pixels': start, 'goal_pixels': goal, 'times': hand.times.tolist(),
-                'grip': start[0] if start else None,
-                'opens': goal[-1] if goal and hand.name in self.opened else None}
+                'grip': start[0] if start else None, 'opens': goal[-1] if goal and opens else None}
 
 
-def _pixels(reading: Reading | None, positions: Floats) -> list[Any]:
+def _pixels(photograph: Measurement | None, positions: Floats) -> list[Any]:
     """Return where a photograph shows (k, 3) positions [m]."""
-    return [] if reading is None or reading.scale is None else numbers(reading.scale.to_pixels(positions))
+    return [] if photograph is None or photograph.scale is None else numbers(
+        photograph.scale.to_pixels(positions))
 
 
-def read_trial(number: int, entry: TrialEntry, readings: dict[str, Reading],
-               held: Sequence[Hold] = ()) -> ReadTrial:
+def draft_trial(number: int, entry: TrialEntry, photographs: Mapping[str, Measurement],
+                held: Sequence[Hold] = ()) -> TrialDraft:
     """
     Return the trial that a document describes, or why there is none yet.
 
     :param number: of the trial, from 1.
-    :param readings: of all photographs, by id.
+    :param photographs: all measurements, by id.
     :param held: the hands that hold the DLO at the start.
     """
-    remarks: list[Remark] = []
-    axes = []
-    shown: dict[str, Reading] = {}
-    for which, one, side in (('start', entry.start, entry.start_side), ('goal', entry.goal, entry.goal_side)):
-        axis = None
-        if one is None:
-            remarks.append(error('Add a photograph of the DLO after the movement.', 'add_goal'))
-        else:
-            shown[which] = readings[one]
-            remarks += about_photograph(readings[one], which, side is None)
-            axis = readings[one].axis
-            if side is not None:
-                remarks += about_photograph(readings[side], f'second {which}', False)
-                axis = _in_space(which, readings[one], readings[side], remarks)
-        axes.append(axis)
-    lengths = tuple(None if axis is None else axis.length for axis in axes)
-    start, goal = axes
+    warnings = TrialWarnings()
+    begin, start = _axis('start', entry.start, entry.start_side, photographs, warnings)
+    end, goal = _axis('goal', entry.goal, entry.goal_side, photographs, warnings)
     if not entry.steps:
-        remarks.append(error('Say what the hand did between the two photographs.', 'add_step'))
-    begun = ReadTrial((), lengths=(lengths[0], lengths[1]), start=shown.get('start'), goal=shown.get('goal'))
-    if start is None or goal is None:
-        return replace(begun, remarks=tuple(remarks))
-    shares = _shares(entry, held, begun.start.count if begun.start else 21)
+        warnings.error('Say what the hand did between the two photographs.', 'add_step')
+    draft = TrialDraft(warnings, begin, end, (None if start is None else start.length,
+                                              None if goal is None else goal.length))
+    if begin is None or start is None or end is None or goal is None:
+        return draft
+    shares = _shares(entry, held, begin.count)
     try:
         chains = start.chain(shares), goal.chain(shares)
     except InputError as refusal:
-        return replace(begun, remarks=(*remarks, error(str(refusal))))
-    remarks += about_axes(start, goal, chains, shares, entry, shown['start'], shown['goal'])
-    moved = None
-    if entry.steps:
-        try:
-            moved = movements(entry.steps, *chains, lambda fraction: int(np.abs(shares - fraction).argmin()),
-                              start.diameter / 2, entry.goal_side is not None, held)
-        except InputError as refusal:
-            remarks.append(error(f'The steps of the hands contradict each other: {refusal}'))
-    if moved is None:
-        return replace(begun, remarks=tuple(remarks))
-    remarks += about_held(held, entry)
-    remarks += about_movements(moved, chains, start.diameter / 2, entry, held)
-    trial = None
-    if not any(one.level == 'error' for one in remarks):
-        trial = _recorded(f'trial {number}', chains, moved, remarks)
-    return replace(begun, remarks=tuple(remarks), trial=trial, hands=moved.hands,
-                   opened=frozenset(hand.name for hand in moved.hands) - set(moved.held_by))
-
-
-def _in_space(which: str, above: Reading, side: Reading, remarks: list[Remark]) -> Axis | None:
-    """Return the axis of a DLO that two photographs of one moment show."""
-    if above.thickness is None or above.trace is None or above.scale is None or side.trace is None or (
-            side.scale is None):
-        return None
+        warnings.error(str(refusal))
+        return draft
+    check_axes(warnings, (start, goal), chains, shares, entry, (begin, end))
+    if not entry.steps:
+        return draft
+    radius = start.diameter / 2
     try:
-        return axis_of_two_views(above.trace, above.scale, side.trace, side.scale, above.thickness)
+        movements = move(entry.steps, *chains, lambda fraction: int(np.abs(shares - fraction).argmin()),
+                         radius, entry.goal_side is not None, held)
     except InputError as refusal:
-        remarks.append(error(f'The two photographs of the {which} do not give the DLO in space: {refusal}'))
-        return None
+        warnings.error(f'The steps of the hands contradict each other: {refusal}')
+        return draft
+    check_hands(warnings, movements, chains, radius, entry, held)
+    trial = None if warnings.has_errors else _recorded(f'trial {number}', chains, movements, warnings)
+    return replace(draft, movements=movements, trial=trial)
+
+
+def _axis(which: str, photograph: str | None, side: str | None, photographs: Mapping[str, Measurement],
+          warnings: TrialWarnings) -> tuple[Measurement | None, Axis | None]:
+    """
+    Return the photograph of a start or goal, and the axis of the DLO in it.
+
+    :param which: `start` or `goal`.
+    :param photograph: its id; `side`: that of a second one of the same moment.
+    """
+    if photograph is None:
+        warnings.error('Add a photograph of the DLO after the movement.', 'add_goal')
+        return None, None
+    above = photographs[photograph]
+    check_photograph(warnings, above, which, side is None)
+    if side is None:
+        return above, above.axis
+    second = photographs[side]
+    check_photograph(warnings, second, f'second {which}', False)
+    if above.thickness is None or above.trace is None or above.scale is None or second.trace is None or (
+            second.scale is None):
+        return above, None
+    try:
+        return above, axis_of_two_views(above.trace, above.scale, second.trace, second.scale, above.thickness)
+    except InputError as refusal:
+        warnings.error(f'The two photographs of the {which} do not give the DLO in space: {refusal}')
+        return above, None
 
 
 def _shares(entry: TrialEntry, held: Sequence[Hold], count: int) -> Floats:
     """Return the fractions of the length, (count,), at which the chain has points: one at each grip."""
     near = SNAP / (count - 1)
     fixed = [0.0, 1.0]
-    grips = [one for step in entry.steps for one in step.fractions] + [one.fraction for one in held]
+    grips = [*(fraction for step in entry.steps for fraction in step.fractions),
+             *(hold.fraction for hold in held)]
     for fraction in sorted(grips):
         if all(abs(fraction - other) > near for other in fixed) and len(fixed) < count:
             fixed.append(fraction)
     return spread_places(np.sort(np.array(fixed)), count)
 
 
-def _recorded(name: str, chains: tuple[Chain, Chain], moved: Movements,
-              remarks: list[Remark]) -> Trial | None:
+def _recorded(name: str, chains: tuple[Chain, Chain], movements: Movements,
+              warnings: TrialWarnings) -> Trial | None:
     """
     Return the trial as it is when a recorded session of it is read again.
 
     So the page calibrates with exactly the numbers of the session.
     """
     try:
-        trial = Trial(name, chains[0], moved.actions,
-                      (Goal(chains[1], moved.end + PAUSE, True, moved.held_by),))
+        trial = Trial(name, chains[0], movements.actions,
+                      (Goal(chains[1], movements.end + PAUSE, True, movements.held_by),))
         collector = TrialCollector(Options())
         for message in trial_messages((trial,), 'world'):
             collector.add(message)
     except InputError as refusal:
-        remarks.append(error(str(refusal)))
+        warnings.error(str(refusal))
         return None
-    found = collector.trials
-    if len(found) != 1 or not _same(found[0], trial):
-        remarks.append(error('This order of steps cannot be kept in a session: take a photograph between the '
-                             'movements, and make each a trial of its own.'))
+    trials = collector.trials
+    if len(trials) != 1 or not _same(trials[0], trial):
+        warnings.error('This order of steps cannot be kept in a session: take a photograph between the '
+                       'movements, and make each a trial of its own.')
         return None
-    return replace(found[0], name=name)
+    return replace(trials[0], name=name)
 
 
-def _same(found: Trial, trial: Trial) -> bool:
-    """Tell whether a trial has all hands of another one, with their grips, and the same hold its goal."""
-    paths = {(hand.name, hand.grips, round(hand.start, 6), round(hand.end, 6)) for hand in found.hands}
-    return found.goals[0].stable and set(found.goals[0].held_by) == set(trial.goals[0].held_by) and all(
-        (hand.name, hand.grips, round(hand.start, 6), round(hand.end, 6)) in paths for hand in trial.hands)
+def _same(recorded: Trial, trial: Trial) -> bool:
+    """Tell whether a recorded trial has all hands of a trial, with their grips, held alike in the goal."""
+    paths, wanted = ({(hand.name, hand.grips, round(hand.start, 6), round(hand.end, 6))
+                      for hand in given.hands} for given in (recorded, trial))
+    return wanted <= paths and recorded.goals[0].stable and (
+        set(recorded.goals[0].held_by) == set(trial.goals[0].held_by))
 
 
-def numbered(trials: Sequence[ReadTrial]) -> tuple[Trial, ...]:
-    """Return the complete trials, named as a session that is read names them."""
-    complete = [one.trial for one in trials if one.trial is not None]
-    return tuple(replace(trial, name=f'trial {number}') for number, trial in enumerate(complete, start=1))
+@dataclass(frozen=True, eq=False)
+class Drafts:
+    """
+    All that follows from a document.
+
+    :param photographs: the measurement of each photograph, by its id.
+    :param trials: in the order of the document.
+    :param mass: of the DLO [kg]; 0: unknown.
+    """
+
+    photographs: Mapping[str, Measurement]
+    trials: tuple[TrialDraft, ...]
+    mass: float = 0.0
+
+    @cached_property
+    def complete(self) -> tuple[Trial, ...]:
+        """The complete trials, named as a session that is read names them."""
+        trials = [draft.trial for draft in self.trials if draft.trial is not None]
+        return tuple(replace(trial, name=f'trial {number}') for number, trial in enumerate(trials, start=1))
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the trials and their options."""
+        return digest(tuple(draft.trial for draft in self.trials), self.options)
+
+    @property
+    def diameter(self) -> float | None:
+        """Diameter of the DLO [m]; None: neither given nor measured yet."""
+        return next((photograph.thickness for photograph in self.photographs.values()), None)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """
+        The options that belong to these trials, by name.
+
+        The table is the plane of the scale; the search for the radius begins at the DLO's own.
+        """
+        options: dict[str, Any] = {'table': True, 'table_height': 0.0, 'mass': self.mass}
+        if self.diameter is not None:
+            value = BY_NAME['self_collision'].value(self.diameter / 2)
+            options['self_collision'] = min(max(value, 0.0), SCALE)
+        return Options.of(options).flat()
+
+    def plain(self) -> dict[str, Any]:
+        """Return what the page draws, as plain values."""
+        return {'photographs': {name: photograph.plain for name, photograph in self.photographs.items()},
+                'trials': [draft.plain for draft in self.trials]}
+
+
+class Drafter:
+    """Drafts the trials of a project's document; it belongs to one thread."""
+
+    def __init__(self, project: Project) -> None:
+        self._project = project
+        self._measurer = Measurer(project)
+        self._drafts: dict[int, tuple[tuple[object, ...], TrialDraft]] = {}
+
+    def prepare(self, photograph: str) -> None:
+        """
+        Prepare a photograph, given by its id, for its first trace.
+
+        :raises InputError: where it cannot be read.
+        """
+        self._measurer.tracer(photograph)
+
+    def draft(self) -> Drafts:
+        """Return all that follows from the present document."""
+        document = self._project.document
+        photographs = self._measurer.measure(document)
+        before, self._drafts = self._drafts, {}
+        goal: str | None = None
+        held_in_goal: tuple[Hold, ...] = ()  # of the trial before
+        for number, entry in enumerate(document.trials, start=1):
+            held = held_in_goal if entry.start == goal else ()
+            key = entry, held, *(photographs[identity] for identity in entry.photographs)
+            same = number in before and before[number][0] == key
+            self._drafts[number] = before[number] if same else (
+                key, draft_trial(number, entry, photographs, held))
+            goal, held_in_goal = entry.goal, held_after(entry.steps, held)
+        return Drafts(photographs, tuple(draft for _, draft in self._drafts.values()), document.dlo.mass)
+
+
+def write_session(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
+    """
+    Write trials to one MCAP file, as if a robot had done them.
+
+    :param options: by name, to be recorded.
+    :raises InputError: where the file cannot be written.
+    """
+    write_records(path, trial_records(trials), options)
+
+
+def write_request(path: Path, trials: Sequence[Trial], options: Mapping[str, Any]) -> None:
+    """
+    Write trials to an XML request.
+
+    :param options: by name.
+    :raises InputError: where there is no trial, or the file cannot be written.
+    """
+    write_document(path, Request(tuple(map(TrialRequest.of, trials)), recordable(options)))

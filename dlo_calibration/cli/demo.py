@@ -26,9 +26,9 @@ def main(args: Sequence[str] | None = None) -> int:
     import argparse
     from pathlib import Path
 
-    from dlo_calibration.cli.conversation import calibrate_sample
+    from dlo_calibration.cli.demo_robot import calibrate_sample
     from dlo_calibration.errors import DloCalibrationError
-    from dlo_calibration.files.samples import samples
+    from dlo_calibration.files.session import samples
 
     parser = argparse.ArgumentParser(prog='demo', description='Calibrate a sample with the real node.')
     parser.add_argument('--output', type=Path, default=Path('demo_output'),

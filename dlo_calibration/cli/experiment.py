@@ -11,22 +11,20 @@ import shlex
 import sys
 from typing import Sequence
 
-from dlo_calibration.calibration.declaration import MACHINE
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.file_options import FileOptions
-from dlo_calibration.calibration.options import names_of, Options
-from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.cli.output import print_json, standard_output, tell
-from dlo_calibration.cli.source import add_common_arguments, read_source
+from dlo_calibration.calibration.options import FileOptions, MACHINE, names_of, Options, recordable
+from dlo_calibration.cli.arguments import add_common_arguments, add_options, given_options, selected
+from dlo_calibration.cli.output import print_json, print_message, standard_output
 from dlo_calibration.errors import InputError, printable
 from dlo_calibration.experiment import tables
-from dlo_calibration.experiment.conduct import conduct, Plan
-from dlo_calibration.experiment.study import Observed, Subject
-from dlo_calibration.files.samples import samples
+from dlo_calibration.experiment.conduct import conduct
+from dlo_calibration.experiment.study import Observed, Study, Subject
+from dlo_calibration.files.session import samples
 from dlo_calibration.search import SEARCHES
 from dlo_calibration.signals import StopFlag
+from dlo_calibration.workspace.source import read_source
 
-#: Options that are not taken from the recordings, so that they are the same for all objects.
+#: Options that come from the command line alone, so that they are the same for all objects.
 SAME_FOR_ALL = ('search', 'evaluations', 'seed', *names_of(MACHINE))
 
 
@@ -53,14 +51,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                              '(default: %(default)s)')
     add_common_arguments(parser)
     # `--search` is declared above; of the machine's options, only `workers` has an effect here.
-    add_options(parser, without=['search', *(name for name in names_of(MACHINE) if name != 'workers')])
+    add_options(parser, {*recordable(Options().flat()), 'workers'} - {'search'})
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    plan = _plan(chosen)
+    plan = _study(chosen)
     with StopFlag() as stop:
-        account, attempts = conduct(plan, chosen.output, make_simulator, stop, tell, sys.stderr)
+        account, attempts = conduct(plan, chosen.output, make_simulator, stop, print_message, sys.stderr)
     if account is None:
         attempts.require()
         raise KeyboardInterrupt(stop.exit_code)
@@ -73,7 +71,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     return 0 if account.complete else stop.exit_code
 
 
-def _plan(chosen: argparse.Namespace) -> Plan:
+def _study(chosen: argparse.Namespace) -> Study:
     """
     Return the experiment that a command line asks for.
 
@@ -90,20 +88,20 @@ def _plan(chosen: argparse.Namespace) -> Plan:
     subjects = []
     for k, (name, path) in enumerate(zip(_names(paths), paths, strict=True)):
         own = _observed(chosen, path)
-        held = () if others else tuple(one - 1 for one in dict.fromkeys(
+        held = () if others else tuple(number - 1 for number in dict.fromkeys(
             chosen.held_back or range(1, len(own.trials) + 1)))
         judges = _observed(chosen, others[k], FileOptions(own.options.flat())) if others else None
         subjects.append(Subject(name, own, held, judges))
     options = subjects[0].observed.options
-    return Plan(tuple(subjects), searches, chosen.runs, options.seed, options.workers,
+    return Study(tuple(subjects), searches, chosen.runs, options.seed, options.workers,
                 _command(chosen, searches), samples=not chosen.sessions)
 
 
 def _observed(chosen: argparse.Namespace, path: Path, of_result: FileOptions | None = None) -> Observed:
     """Return the trials of a session, with the options to use on them."""
-    source = read_source(chosen, lambda text: tell(f'{path}: {text}'), of_result, path).require_trials()
+    source = read_source(selected(chosen, path), lambda text: print_message(f'{path}: {text}'), of_result)
     same = {**Options().flat(), **given_options(chosen)}
-    return Observed(source.trials, Options.of({**source.options.flat(),
+    return Observed(source.require_trials().trials, Options.of({**source.options.flat(),
                                                **{name: same[name] for name in SAME_FOR_ALL}}))
 
 
@@ -121,7 +119,7 @@ def _command(chosen: argparse.Namespace, searches: Sequence[str]) -> str:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Name the objects after their sessions; a name that is taken gets a number."""
+    """Name the objects after their sessions; a repeated name gets a number."""
     names = [printable(path.stem if path.suffix in ('.mcap', '.db3', '.xml') else path.resolve().name)
              for path in paths]
     return [name if name not in names[:k] else f'{name}_{names[:k].count(name) + 1}'

@@ -11,8 +11,8 @@ from typing import Callable, Mapping
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.cli.output import tell
+from dlo_calibration.cli.arguments import add_options, given_options
+from dlo_calibration.cli.output import print_message
 from dlo_calibration.errors import InputError, one_of
 from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.export.mjcf import FORMS as MJCF_FORMS
@@ -20,7 +20,7 @@ from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.export.usd import FORMS as USD_FORMS
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
-from dlo_calibration.writing import whole
+from dlo_calibration.writing import write_file
 
 USED = ('nodes', 'table', 'table_height')  # options
 #: Format -> what makes its text, and the names of its forms, the first one by default.
@@ -38,8 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'where the DLO lies: a CSV file with rows x,y,z [m], first point to last, or an XML document'))
     parser.add_argument('--output', metavar='FILE', type=Path, required=True, help='the file to write')
     parser.add_argument('--form', metavar='NAME', help=f'form of the format ({forms}; default: the first)')
-    add_options(parser, without=[one.name for one in Options.declarations() if one.name not in USED],
-                title='options of the DLO (default: those of the result)')
+    add_options(parser, USED, title='options of the DLO (default: those of the result)')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
@@ -48,16 +47,16 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     if chosen.form is not None and chosen.form not in forms:
         raise InputError('--form', repr(chosen.form), one_of(forms, chosen.form) if forms else
                          f'no form: {chosen.format} has only one', 'correct it')
-    found = read_result(chosen.result)
-    for text in found.problems:
-        tell(text)
-    known = {name: value for name, value in found.file_options.values.items() if name in USED}
+    description = read_result(chosen.result)
+    for text in description.problems:
+        print_message(text)
+    known = {name: value for name, value in description.file_options.values.items() if name in USED}
     options = Options.of({**known, **given_options(chosen)})
     chain = read_chain_file(chosen.start)
-    text = export(found, chain, options=options, **({} if chosen.form is None else {'form': chosen.form}))
-    with whole(chosen.output) as new:
-        new.write_text(text, encoding='utf-8')
-    for remark in ExportedRope.of(found, chain, options).remarks:
-        tell(remark)
-    tell(f'the DLO is in {chosen.output}')
+    form = {} if chosen.form is None else {'form': chosen.form}
+    text = export(description, chain, options=options, **form)
+    write_file(chosen.output, text)
+    for warning in ExportedRope.of(description, chain, options).warnings:
+        print_message(warning)
+    print_message(f'the DLO is in {chosen.output}')
     return 0

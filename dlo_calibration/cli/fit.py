@@ -10,37 +10,27 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
 
-from dlo_calibration.calibration.automatic import choose
 from dlo_calibration.calibration.calibrate import calibrate
+from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.plain import plain
-from dlo_calibration.cli.options import given_options
-from dlo_calibration.cli.output import print_json, print_result, tell
-from dlo_calibration.cli.result_files import (
-    EVALUATIONS,
-    file_names,
-    INPUTS,
-    keep_input,
-    REPORT,
-    REQUEST,
-    RESULT,
-    SESSION,
-    write_files,
-)
-from dlo_calibration.cli.source import add_source, left_out, read_source, Source
-from dlo_calibration.cli.unfinished import Unfinished
+from dlo_calibration.calibration.result import plain
+from dlo_calibration.cli.arguments import add_source, selected
+from dlo_calibration.cli.output import print_json, print_message, print_result
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError, SimulationError
-from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.log import EvaluationLog
 from dlo_calibration.files.result import HOW, read_result
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.writing import make_folder
-
-if TYPE_CHECKING:
-    from dlo_calibration.report.terminal import SearchBar
+from dlo_calibration.workspace.folder import (
+    CalibrationFolder,
+    EVALUATIONS,
+    FILES,
+    input_in,
+    REPORT,
+    RESULT,
+    SESSION,
+)
+from dlo_calibration.workspace.source import read_source, Source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,92 +48,87 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     with ExitStack() as stack:
-        unfinished, log = None, None
+        folder = None
         if chosen.resume is not None:
-            if not Unfinished.is_in(chosen.resume):
+            if not CalibrationFolder.is_unfinished(chosen.resume):
                 return _finished(chosen, make_simulator)
-            unfinished = stack.enter_context(Unfinished(chosen.resume, INPUTS))
-            unfinished.complete(chosen)
+            folder = stack.enter_context(CalibrationFolder(chosen.resume))
+            selection = selected(chosen, chosen.session or folder.input)
+            if chosen.session is None:  # the copy of the input has the calibrator's names
+                selection = replace(selection, remap={})
+            selection = folder.resume(selection)
         elif chosen.session is None:
             raise InputError('fit', 'no SESSION', 'a session or a request', 'name it, or --resume DIR')
-        source = read_source(chosen, tell).require_trials()
-        folder = chosen.resume or chosen.output
-        if folder is None and 'output_directory' in given_options(chosen):
-            folder = Path(source.options.output_directory)
+        else:
+            selection = selected(chosen)
+        source = read_source(selection, print_message).require_trials()
+        output = chosen.output
+        if output is None and 'output_directory' in selection.options:
+            output = Path(source.options.output_directory)
+        if folder is None and output is not None:
+            folder = stack.enter_context(CalibrationFolder(output))
         if folder is not None:
-            make_folder(folder)  # before hours are spent on a search
-            unfinished = unfinished or stack.enter_context(Unfinished(folder, INPUTS))
-            namespace = None if source.session.messages.remapped else chosen.namespace
-            log = unfinished.begin(source, namespace, lambda path: keep_input(path, source), tell,
-                                   left_out(chosen))
-        stopped = _fit(chosen, source, folder, make_simulator, log)
-        if unfinished is not None and not stopped:
-            unfinished.remove()
-        elif log is not None:
-            tell(f'the calibration was stopped; it goes on with: dlo-calibration fit --resume {folder}')
+            folder.begin(source, print_message)
+        _fit(chosen, source, folder, make_simulator)
     return 0
 
 
-def _fit(chosen: argparse.Namespace, source: Source, folder: Path | None, make_simulator: SimulatorFactory,
-         log: EvaluationLog | None) -> bool:
-    """Calibrate, print the result, and write it; return whether the user stopped it."""
-    told: list[str] = []
-    bar: SearchBar | None = None
+def _fit(chosen: argparse.Namespace, source: Source, folder: CalibrationFolder | None,
+         make_simulator: SimulatorFactory) -> None:
+    """Calibrate, print the result, and write its files."""
+    from dlo_calibration.report.terminal import SearchBar
+
+    warnings: list[str] = []
+    log = None if folder is None else folder.log
 
     def warn_once(text: str) -> None:
-        if text not in told:
-            tell(f'warning: {text}')
-            told.append(text)
+        if text not in warnings:
+            print_message(f'warning: {text}')
+            warnings.append(text)
 
-    def show(evaluation: Evaluation) -> None:
-        nonlocal bar
-        if bar is None:  # what draws it takes as long to load as the first simulations, which go on meanwhile
-            from dlo_calibration.report.terminal import SearchBar
-
-            most = choose(source.trials, source.options).options.evaluations
-            bar = stack.enter_context(SearchBar(
-                most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0))
-        bar.take(evaluation)
-
+    most = choose(source.trials, source.options).options.evaluations
     with StopFlag() as stop:
-        with ExitStack() as stack:
+        with SearchBar(most, sys.stderr, shown=not chosen.json, known=log.evaluations if log else 0) as bar:
             try:
                 result = calibrate(
-                    source.trials, source.options, on_evaluation=show, on_notice=warn_once,
+                    source.trials, source.options, on_evaluation=bar.take, on_notice=warn_once,
                     should_stop=stop, make_simulator=make_simulator, log=log)
             except SimulationError:
-                if not stop():
-                    if log is not None:  # the same would happen again
-                        log.remove()
-                    raise
-                raise KeyboardInterrupt(stop.exit_code) from None
+                if stop():
+                    raise KeyboardInterrupt(stop.exit_code) from None
+                if folder is not None:  # it would fail again
+                    folder.discard()
+                raise
         stopped = stop()
         try:
-            print_result(result, chosen.json, told)  # first, as the page takes seconds
+            print_result(result, chosen.json, warnings)  # first, as the page takes seconds
         finally:  # whatever becomes of the output
-            attempts = None if folder is None else write_files(folder, source, result, make_simulator, stop)
-        if attempts is not None:
+            if folder is not None:
+                attempts = folder.complete(result, make_simulator, stop, stopped=stopped)
+        if folder is not None:
             attempts.require()
-            tell(f'{", ".join(file_names(source))} are in {folder}')
-    return stopped
+            written = ', '.join(name for name in FILES if name in attempts.written)
+            print_message(f'{written} are in {folder.path}')
+            if stopped and log is not None:
+                print_message('the calibration was stopped; it goes on with: '
+                              f'dlo-calibration fit --resume {folder.path}')
 
 
 def _finished(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """
-    Say that there is nothing to resume in a folder, and print its result, if JSON is wanted.
+    Say that a folder has nothing to resume; with `--json`, print its result.
 
-    Its trials are simulated once more, as the file does not hold all that the document tells.
+    The trials are simulated once more, because `result.xml` does not hold everything that JSON shows.
     """
     folder: Path = chosen.resume
     if not (folder / RESULT).is_file():
         raise InputError(f'folder {folder}', 'no interrupted calibration', 'one that fit --output began',
                          'check the folder, or begin with fit SESSION --output')
-    tell(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
+    print_message(f'nothing to resume: the calibration is finished, and its result is {folder / RESULT}')
     if chosen.json:
         file = read_result(folder / RESULT)
-        if chosen.session is None:
-            chosen.session = folder / (REQUEST if (folder / REQUEST).is_file() else SESSION)
-        source = read_source(chosen, tell, file.file_options).require_trials()
+        source = read_source(selected(chosen, chosen.session or input_in(folder)), print_message,
+                             file.file_options).require_trials()
         trials = [trial for trial in source.trials if trial.name in file.trials]
         result = replace(validated(file, trials, source.options, make_simulator),
                          warnings=file.warnings, confirmation=file.confirmation)

@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from dlo_calibration.calibration.automatic import choose
+from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.cli.arguments import add_source, selected
 from dlo_calibration.cli.output import print_json, standard_output
-from dlo_calibration.cli.source import add_source, read_source, Source
 from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.workspace.source import read_source, Source
 
 add_arguments = add_source
 
@@ -22,7 +23,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     from dlo_calibration.report import terminal
 
-    about = _about(read_source(chosen, lambda text: None, any_topics=True))
+    about = _about(read_source(selected(chosen), lambda text: None, any_topics=True))
     if chosen.json:
         print_json(about)
     else:
@@ -44,11 +45,11 @@ def _about(source: Source) -> dict[str, Any]:
         'choice': choice.words,
         'trials': [_about_trial(number, trial)
                    for number, trial in zip(source.numbers, source.trials, strict=True)],
-        'refusals': list(source.refusals), 'problems': [*source.session.problems, *source.doubts]}
+        'refusals': list(source.refusals), 'problems': [*source.session.problems, *source.implausible]}
 
 
 def _about_topic(topic: str, kind: str, count: int) -> dict[str, Any]:
-    """Describe a topic that the calibrator does not know, and say what it could be."""
+    """Describe a topic that the calibrator does not know, with a hint which input it could be."""
     fits = [name for name, needed in INPUT_TYPES.items() if needed == kind]
     hint = f'if {topic} has the actions, add --remap {topic}:={ACTION}'
     if GOAL in fits:

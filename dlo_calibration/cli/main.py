@@ -11,8 +11,8 @@ from signal import SIGINT
 import sys
 from typing import Any, NoReturn, Sequence, TYPE_CHECKING
 
-from dlo_calibration.cli.output import tell
-from dlo_calibration.errors import DloCalibrationError, InputError, meant, one_of, printable
+from dlo_calibration.cli.output import print_message
+from dlo_calibration.errors import DloCalibrationError, InputError, one_of, printable, suggestion
 from dlo_calibration.signals import exit_code
 
 if TYPE_CHECKING:
@@ -56,17 +56,16 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | N
             raise InputError('verb', 'none', f'one of {", ".join(VERBS)}', f'see {PROGRAM} --help')
         if words[0] not in VERBS and not words[0].startswith('-'):
             raise InputError('verb', repr(words[0]), one_of(VERBS, words[0]),
-                             meant(words[0], VERBS, f'see {PROGRAM} --help'))
+                             suggestion(words[0], VERBS, f'see {PROGRAM} --help'))
         chosen = _parser(words).parse_args(words)
         from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 
-        code: int = chosen.act(chosen, make_simulator or make_chosen_simulator)
-        return code
+        return int(chosen.act(chosen, make_simulator or make_chosen_simulator))
     except DloCalibrationError as error:
-        tell(f'{PROGRAM}: {" ".join(str(error).split())}')
+        print_message(f'{PROGRAM}: {" ".join(str(error).split())}')
         return 2
     except KeyboardInterrupt as interrupt:
-        tell(f'{PROGRAM}: interrupted')
+        print_message(f'{PROGRAM}: interrupted')
         return int(interrupt.args[0]) if interrupt.args else exit_code(SIGINT)
     except BrokenPipeError:  # the reader of the pipe, such as `head`, has ended
         sys.stderr.close()
@@ -74,28 +73,29 @@ def main(args: Sequence[str] | None = None, make_simulator: SimulatorFactory | N
 
 
 class _Help(argparse.HelpFormatter):
-    """Help whose first lines show what is a verb's own; the options of a calibration are listed below."""
+    """Help whose usage lists only the verb's own arguments; the options of a calibration follow below."""
 
     def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: Any = None) -> None:
-        """Leave the options out."""
-        from dlo_calibration.cli.options import PREFIX
+        """Leave out the options."""
+        from dlo_calibration.cli.arguments import PREFIX
 
-        super().add_usage(usage, [one for one in actions if not one.dest.startswith(PREFIX)], groups, prefix)
+        super().add_usage(
+            usage, [action for action in actions if not action.dest.startswith(PREFIX)], groups, prefix)
 
 
 class _Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line, and names the flag that was probably meant."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse a flag that this verb does not have; one may be typed with underscores."""
+        """Refuse a flag that this verb does not have; flags may be typed with underscores."""
         if self.prog == PROGRAM:
             return super().parse_known_args(args, namespace)
-        from dlo_calibration.cli.options import dashed
+        from dlo_calibration.cli.arguments import dashed
 
         chosen, rest = super().parse_known_args(dashed(args), namespace)
         strange = [word.partition('=')[0] for word in rest if word.startswith('--')]
         if strange:
-            hint = meant(strange[0], self._option_string_actions, '')
+            hint = suggestion(strange[0], self._option_string_actions, '')
             self.error(f'unrecognized arguments: {" ".join(rest)}{"; " if hint else ""}{hint}')
         return chosen, rest
 
@@ -104,7 +104,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser; only a verb that is among the words is loaded, and has its arguments."""
+    """Return the parser; only a verb among the words is loaded and gets its arguments."""
     parser = _Parser(prog=PROGRAM, allow_abbrev=False, description=(
         'Find the physical parameters of a rope, cable, wire or hose from recorded manipulations.'))
     verbs = parser.add_subparsers(required=True, metavar='VERB')

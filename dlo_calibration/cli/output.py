@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Output: verbs print JSON or tables on stdout, and everything else on stderr."""
+"""Output: verbs print JSON or tables on stdout, and messages on stderr."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 import json
 import os
 import sys
-from typing import Any, Iterator, Mapping, Sequence, TextIO, TYPE_CHECKING
+from typing import Any, Iterable, Iterator, Mapping, Sequence, TextIO, TYPE_CHECKING
 
 from dlo_calibration.errors import DloCalibrationError, printable
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from dlo_calibration.calibration.result import CalibrationResult
 
 
-def tell(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a line on stderr, if that is possible."""
-    with suppress(OSError):  # where stderr is a file on a full disk, the work goes on
+    with suppress(OSError):  # if stderr is a file on a full disk, the work goes on
         sys.stderr.write(f'{printable(text)}\n')
 
 
 def flush() -> None:
-    """Write what waits for stdout and stderr; if that fails, drop it, so that Python's end does not fail."""
+    """Flush stdout and stderr; drop what cannot be written, so that the interpreter ends without error."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -52,26 +52,36 @@ def standard_output() -> Iterator[TextIO]:
 
 def print_json(value: Mapping[str, Any]) -> None:
     """Print one JSON document, with null for numbers that are not finite."""
-    from dlo_calibration.calibration.plain import known
+    from dlo_calibration.calibration.result import with_nulls
 
     with standard_output() as stream:
-        json.dump(known(value), stream, indent=2, allow_nan=False)
+        json.dump(with_nulls(value), stream, indent=2, allow_nan=False)
         stream.write('\n')
 
 
-def print_result(result: CalibrationResult, as_json: bool, told: Sequence[str] = ()) -> None:
-    """
-    Print a result on stdout, or else on stderr, and its warnings on stderr.
+def print_sentences(sentences: Iterable[str]) -> None:
+    """Print sentences on stdout, wrapped to its width."""
+    from dlo_calibration.report.terminal import console, escape
 
-    :param told: warnings that have been printed already.
+    with standard_output() as stream:
+        out = console(stream)
+        for sentence in sentences:
+            out.print(escape(sentence))
+
+
+def print_result(result: CalibrationResult, as_json: bool, printed: Sequence[str] = ()) -> None:
+    """
+    Print a result on stdout, and its warnings on stderr; without stdout, print both there.
+
+    :param printed: warnings that have been printed already.
     :raises DloCalibrationError: if stdout cannot be written.
     """
-    from dlo_calibration.calibration.plain import plain
+    from dlo_calibration.calibration.result import plain
     from dlo_calibration.report import terminal
 
     for warning in result.warnings:
-        if warning not in told:
-            tell(f'warning: {warning}')
+        if warning not in printed:
+            print_message(f'warning: {warning}')
     try:
         if as_json:
             print_json(plain(result))

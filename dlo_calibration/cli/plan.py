@@ -6,26 +6,31 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
+from itertools import count, takewhile
+import json
 from pathlib import Path
 import sys
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.options import add_options, given_options
-from dlo_calibration.cli.output import print_json, standard_output, tell
-from dlo_calibration.cli.plan_files import PLAN, write_plan_files
-from dlo_calibration.files.chain_file import read_chain_file
+from dlo_calibration.calibration.options import Options, SIMULATION
+from dlo_calibration.cli.arguments import add_options, given_options
+from dlo_calibration.cli.output import print_json, print_message, print_sentences
+from dlo_calibration.errors import unwritable
+from dlo_calibration.files.chain_file import read_chain_file, write_chain
+from dlo_calibration.files.request import Request, TrialRequest, write_request
 from dlo_calibration.files.result import Description, read_result
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.planning.options import PlanOptions
-from dlo_calibration.planning.plain import plain_plan
-from dlo_calibration.planning.plan import Plan
+from dlo_calibration.planning.plan import plain_plan, Plan
 from dlo_calibration.planning.planner import plan
+from dlo_calibration.planning.rehearsal import ActionStep, in_turn
 from dlo_calibration.signals import StopFlag
-from dlo_calibration.writing import make_folder
+from dlo_calibration.writing import Attempts, make_folder, whole
 
-#: The options that a simulation needs.
-SIMULATION = ('engine', 'table', 'table_height', 'scene', 'nodes', 'time_step', 'stable_distance',
-              'stable_time', 'settle_limit', 'answer_limit')
+PLAN = 'plan'  # begins the names of files
+OF_PLACE = ('table', 'table_height')  # options that say where the DLO lies
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,55 +45,85 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'after_1.csv, after_2.csv, ... to this folder'))
     parser.add_argument('--json', action='store_true', help='print one JSON document')
     add_options(parser, kind=PlanOptions, title='options of the plan')
-    add_options(parser, without=[one.name for one in Options.declarations() if one.name not in SIMULATION],
-                title='options of the simulation (default: those of the result)')
+    add_options(parser, SIMULATION, title='options of the simulation (default: those of the result)')
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    from dlo_calibration.report.plan_sentences import plan_sentences
+    from dlo_calibration.report.sentences import plan_sentences
     from dlo_calibration.report.terminal import PlanBar
 
     options = PlanOptions.of(given_options(chosen, PlanOptions))
-    found = read_result(chosen.result)
-    simulation = _simulation(chosen, found)
+    description = read_result(chosen.result)
+    of_result = description.file_options
+    for text in of_result.problems:
+        if text != str(of_result.refusal):
+            print_message(text)
+    simulation = of_result.options(given_options(chosen))
     start, goal = read_chain_file(chosen.start), read_chain_file(chosen.goal)
     if chosen.output is not None:
         make_folder(chosen.output)  # before the search
     with StopFlag() as stop:
         with PlanBar(sys.stderr, shown=not chosen.json) as bar:
-            made = plan(found, start, goal, options, simulation=simulation, on_progress=bar.take,
+            made = plan(description, start, goal, options, simulation=simulation, on_progress=bar.take,
                         should_stop=stop, make_simulator=make_simulator)
         if stop() and not made.actions and not made.reached:
             raise KeyboardInterrupt(stop.exit_code)
         try:
-            _print(made, plan_sentences(made), chosen.json)  # first, as drawings take seconds
+            if chosen.json:  # first, as drawings take seconds
+                print_json(plain_plan(made))
+            else:
+                print_sentences(plan_sentences(made))
         finally:  # whatever becomes of the output
             if chosen.output is not None:
-                write_plan_files(chosen.output, made, found, simulation, make_simulator)
-                tell(f'the plan is in {chosen.output}')
+                write_plan_files(chosen.output, made, description, simulation, make_simulator)
+                print_message(f'the plan is in {chosen.output}')
     return 0
 
 
-def _simulation(chosen: argparse.Namespace, found: Description) -> Options:
-    """Return the options of the simulation: those of the result, where no flag says otherwise."""
-    given, of_result = given_options(chosen), found.file_options
-    for text in of_result.problems:
-        if text != str(of_result.refusal):
-            tell(text)
-    if of_result.refusal is not None and 'scene' not in given:
-        raise of_result.refusal
-    return Options.of({**of_result.values, **given})
+def write_plan_files(folder: Path, plan: Plan, description: Description, simulation: Options,
+                     make_simulator: SimulatorFactory) -> None:
+    """
+    Write a plan to a folder, as far as possible; it replaces an older one.
+
+    :raises DloCalibrationError: if files cannot be written; the others are.
+    """
+    from dlo_calibration.report.plan_drawing import write_plan_animation, write_plan_picture
+
+    _remove_older(folder)
+    attempts = Attempts(folder)
+    path = folder / PLAN
+    with attempts.attempt(f'{PLAN}.json'), whole(path.with_suffix('.json')) as new:
+        new.write_text(f'{json.dumps(plain_plan(plan), indent=2, allow_nan=False)}\n', encoding='utf-8')
+    for k, action in enumerate(plan.actions, start=1):
+        with attempts.attempt(f'after_{k}.csv'):
+            write_chain(folder / f'after_{k}.csv', Chain(action.predicted))
+    if plan.actions:
+        with attempts.attempt(f'{PLAN}.xml'):
+            write_request(path.with_suffix('.xml'), plan_request(plan, description, simulation))
+    with attempts.attempt(f'{PLAN}.png'):
+        write_plan_picture(plan, path.with_suffix('.png'))
+    if plan.actions:
+        with attempts.attempt(f'{PLAN}.gif'), closing(make_simulator(simulation)) as simulator:
+            write_plan_animation(plan, simulator, Posterior.of(description).best, path.with_suffix('.gif'))
+    attempts.require()
 
 
-def _print(made: Plan, sentences: list[str], as_json: bool) -> None:
-    """Print a plan on stdout."""
-    if as_json:
-        print_json(plain_plan(made))
+def plan_request(plan: Plan, description: Description, simulation: Options) -> Request:
+    """Return the request to simulate the actions of a plan, at least one."""
+    steps = in_turn([ActionStep(planned.action) for planned in plan.actions])
+    options = {name: value for name, value in simulation.flat().items() if name in OF_PLACE}
+    return Request((TrialRequest(PLAN, plan.start, tuple(step.action for step in steps), ()),),
+                   {**options, 'mass': description.mass})
+
+
+def _remove_older(folder: Path) -> None:
+    """Remove the files of an older plan, which may have more actions."""
+    if not (folder / f'{PLAN}.json').is_file():
         return
-    from dlo_calibration.report.terminal import console, escape
-
-    with standard_output() as stream:
-        out = console(stream)
-        for sentence in sentences:
-            out.print(escape(sentence))
+    chains = takewhile(Path.is_file, (folder / f'after_{k}.csv' for k in count(1)))
+    for path in (*(folder / f'{PLAN}{suffix}' for suffix in ('.xml', '.gif')), *chains):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(path, error) from error

@@ -10,10 +10,11 @@ from contextlib import closing
 from pathlib import Path
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.cli.output import print_json, tell
-from dlo_calibration.cli.source import add_source, read_result_file, read_source
+from dlo_calibration.cli.arguments import add_source, read_result_file, selected
+from dlo_calibration.cli.output import print_json, print_message
 from dlo_calibration.cli.validate import validated
 from dlo_calibration.errors import InputError
+from dlo_calibration.workspace.source import read_source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,16 +37,17 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
         raise InputError('--animation', 'no RESULT.xml', 'parameters to simulate with',
                          'name a result: dlo-calibration plot SESSION RESULT.xml --animation')
     file = None if chosen.result is None else read_result_file(chosen)
-    source = read_source(chosen, tell, None if file is None else file.file_options).require_trials()
+    of_result = None if file is None else file.file_options
+    source = read_source(selected(chosen), print_message, of_result).require_trials()
     result = None if file is None else validated(file, source.trials, source.options, make_simulator)
-    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output, tell,
-                              source.numbers)
+    pictures = write_pictures(source.trials, None if result is None else result.chains, chosen.output,
+                              print_message, source.numbers)
     animations: list[Path] = []
     if chosen.animation and result is not None:
         physical = result.space.physical(result.values, result.length)
         with closing(make_simulator(source.options)) as simulator:
-            animations = write_animations(result.trials, simulator, physical, chosen.output, tell,
-                                          source.numbers)
+            animations = write_animations(result.trials, simulator, physical, chosen.output,
+                                          print_message, source.numbers)
     if chosen.json:
         print_json({'pictures': [str(path) for path in pictures],
                     'animations': [str(path) for path in animations]})

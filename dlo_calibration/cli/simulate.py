@@ -7,32 +7,34 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
+import json
 from pathlib import Path
 import time
 from typing import Any, Mapping, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.cli.options import add_options
-from dlo_calibration.cli.output import print_json, standard_output, tell
-from dlo_calibration.cli.plan import SIMULATION
-from dlo_calibration.cli.prediction_files import write_prediction_files
-from dlo_calibration.cli.source import (
+from dlo_calibration.calibration.options import Options, SIMULATION
+from dlo_calibration.cli.arguments import (
     add_common_arguments,
+    add_options,
     add_without,
-    read_manipulations,
     read_result_file,
+    selected,
 )
+from dlo_calibration.cli.output import print_json, print_message, print_sentences
 from dlo_calibration.errors import InputError
+from dlo_calibration.files.chain_file import write_chain
 from dlo_calibration.files.result import Description
-from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.model.chain import Chain
+from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.observation.table import resting_level
-from dlo_calibration.planning.course import simulated_course
-from dlo_calibration.planning.plain import plain_prediction
-from dlo_calibration.planning.prediction import DRAWS, Prediction, simulate
+from dlo_calibration.planning.prediction import DRAWS, plain_prediction, Prediction, simulate
+from dlo_calibration.planning.rehearsal import motion_of_actions
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.writing import make_folder
+from dlo_calibration.workspace.source import read_manipulations
+from dlo_calibration.writing import Attempts, make_folder, whole
 
+ALL = 'simulation.json'  # file with all predictions
 MOST_DRAWS = 10_000
 Named = Sequence[tuple[str, Prediction]]  # names of trials, which can be anything, and what happens there
 USED = (*SIMULATION, 'grip_tolerance', 'length_tolerance', 'release')  # options
@@ -54,44 +56,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--draws', type=int, default=DRAWS, help=(
         f'number of draws from the posterior, for the 90 %% intervals; default {DRAWS}'))
     parser.add_argument('--seed', type=int, default=1, help='of these draws; default 1')
-    add_options(parser, without=[one.name for one in Options.declarations() if one.name not in USED])
+    add_options(parser, USED)
 
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
+    from dlo_calibration.report.sentences import prediction_sentences
+
     for name, least, most in (('draws', 0, MOST_DRAWS), ('seed', 0, 2**32 - 1)):
         if not least <= getattr(chosen, name) <= most:
             raise InputError(f'--{name}', str(getattr(chosen, name)), f'{least} to {most}', 'correct it')
-    found = read_result_file(chosen)
-    manipulations, options = read_manipulations(chosen, tell, found.file_options)
+    description = read_result_file(chosen)
+    manipulations, options = read_manipulations(selected(chosen), print_message, description.file_options)
     if chosen.output is not None:
         make_folder(chosen.output)  # before the simulations
     begun = time.monotonic()
-    predictions = [(one.name, _predicted(found, one, options, chosen, make_simulator))
-                   for one in manipulations]
+    predictions = [(manipulation.name, _predicted(description, manipulation, options, chosen, make_simulator))
+                   for manipulation in manipulations]
     with closing(make_simulator(options)) as simulator:
         about = {**_plain(predictions), 'draws': chosen.draws, 'seed': chosen.seed, 'engine': simulator.name,
                  'seconds': time.monotonic() - begun}
         try:
             if chosen.output is not None:
                 write_prediction_files(chosen.output, predictions, about, simulator)
-                tell(f'the predictions are in {chosen.output}')
+                print_message(f'the predictions are in {chosen.output}')
         finally:  # whatever the disk does
-            _print(predictions, about, chosen.json)
+            if chosen.json:
+                print_json(about)
+            else:
+                print_sentences(sentence for name, prediction in predictions
+                                for sentence in (f'{name}:', *prediction_sentences(prediction)))
         if chosen.gui:
             _show(predictions, options, simulator)
     return 0
 
 
-def _predicted(found: Description, asked: Manipulation, options: Options, chosen: argparse.Namespace,
+def _predicted(description: Description, asked: Manipulation, options: Options, chosen: argparse.Namespace,
                make_simulator: SimulatorFactory) -> Prediction:
-    """Return the prediction of a trial, and tell if its DLO is hardly the calibrated one."""
-    change = abs(asked.start.length - found.length) / found.length * 100
+    """Return the prediction of a trial, with a warning if its DLO is hardly the calibrated one."""
+    change = abs(asked.start.length - description.length) / description.length * 100
     if change > options.length_tolerance:
-        tell(f'trial {asked.name!r}: its chain is {asked.start.length:.4g} m long, {change:.0f} % from the '
-             f'{found.length:.4g} m of the calibrated DLO; check that both are the same DLO, in metres')
+        print_message(
+            f'trial {asked.name!r}: its chain is {asked.start.length:.4g} m long, {change:.0f} % from the '
+            f'{description.length:.4g} m of the calibrated DLO; check that both are the same DLO, in metres')
     try:
-        return simulate(found, asked.start, asked.steps, options=options, draws=chosen.draws,
+        return simulate(description, asked.start, asked.steps, options=options, draws=chosen.draws,
                         seed=chosen.seed, make_simulator=make_simulator)
     except InputError as error:
         raise InputError(f'trial {asked.name!r}, {error.thing}', error.came, error.expected,
@@ -100,25 +109,11 @@ def _predicted(found: Description, asked: Manipulation, options: Options, chosen
 
 def _plain(predictions: Named) -> dict[str, Any]:
     """Return the actions of all trials as plain values, each with the name of its trial."""
-    told = [(name, plain_prediction(one)) for name, one in predictions]
-    return {'actions': [{'trial': name, **action} for name, one in told for action in one['actions']],
-            'remarks': [f'trial {name!r}: {remark}' for name, one in told for remark in one['remarks']]}
-
-
-def _print(predictions: Named, about: Mapping[str, Any], as_json: bool) -> None:
-    """Print predictions on stdout."""
-    if as_json:
-        print_json(about)
-        return
-    from dlo_calibration.report.prediction_sentences import prediction_sentences
-    from dlo_calibration.report.terminal import console, escape
-
-    with standard_output() as stream:
-        out = console(stream)
-        for name, one in predictions:
-            out.print(escape(f'{name}:'))
-            for sentence in prediction_sentences(one):
-                out.print(escape(sentence))
+    plain = [(name, plain_prediction(prediction)) for name, prediction in predictions]
+    return {'actions': [{'trial': name, **action}
+                        for name, prediction in plain for action in prediction['actions']],
+            'remarks': [f'trial {name!r}: {remark}'
+                        for name, prediction in plain for remark in prediction['remarks']]}
 
 
 def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
@@ -131,11 +126,42 @@ def _show(predictions: Named, options: Options, simulator: Simulator) -> None:
     from dlo_calibration.simulation.window import Film, FRAME_RATE, MOST_FRAMES, show
 
     radius, films, levels = predictions[0][1].physical['self_collision'], [], []
-    for name, one in predictions:
-        trial, motion = simulated_course(one.start, [step.step for step in one.steps], simulator,
-                                         one.physical, frame_rate=FRAME_RATE, most=MOST_FRAMES)
+    for name, prediction in predictions:
+        trial, motion = motion_of_actions(
+            prediction.start, [step.step for step in prediction.steps], simulator, prediction.physical,
+            frame_rate=FRAME_RATE, most=MOST_FRAMES)
         films.append(Film.of(name, trial, motion, hand_colours([trial]), radius))
         levels.append(resting_level(trial, options.table_height))
     known = [level - radius for level in levels if level is not None]
     show(films, radius, min(known, default=options.table_height) if options.table else None, options.scene,
-         lambda: tell('close the window, or press Ctrl-C, to end'))
+         lambda: print_message('close the window, or press Ctrl-C, to end'))
+
+
+def write_prediction_files(folder: Path, predictions: Sequence[tuple[str, Prediction]],
+                           about: Mapping[str, Any], simulator: Simulator) -> None:
+    """
+    Write predictions to a folder, as far as possible.
+
+    :param predictions: names of trials, which can be anything, and what happens in them.
+    :param about: the same, as plain values.
+    :raises DloCalibrationError: if files cannot be written; the others are.
+    """
+    from dlo_calibration.report.plan_drawing import (
+        write_prediction_animation,
+        write_prediction_picture,
+    )
+
+    attempts = Attempts(folder)
+    with attempts.attempt(ALL), whole(folder / ALL) as new:
+        new.write_text(f'{json.dumps(about, indent=2, allow_nan=False)}\n', encoding='utf-8')
+    for k, (name, prediction) in enumerate(predictions, start=1):
+        for number, step in enumerate(prediction.steps, start=1):
+            for suffix in ('csv', 'xml'):
+                file = f'trial_{k}_after_{number}.{suffix}'
+                with attempts.attempt(file):
+                    write_chain(folder / file, Chain(step.chain))
+        with attempts.attempt(f'trial_{k}.png'):
+            write_prediction_picture(prediction, name, folder / f'trial_{k}.png')
+        with attempts.attempt(f'trial_{k}.gif'):
+            write_prediction_animation(prediction, name, simulator, folder / f'trial_{k}.gif')
+    attempts.require()

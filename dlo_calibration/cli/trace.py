@@ -8,19 +8,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.cli.output import print_json, standard_output
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.chain import Chain, Floats, MOST_POINTS
-
-if TYPE_CHECKING:  # they load OpenCV, which other verbs do not need
-    from dlo_calibration.capture.photograph import Photograph
-    from dlo_calibration.capture.scale import Scale
-    from dlo_calibration.capture.trace import Trace
+from dlo_calibration.files.chain_file import write_chain
+from dlo_calibration.model.chain import MOST_POINTS
+from dlo_calibration.vision.axis import axis_of, measured_diameter
+from dlo_calibration.vision.board import find_board
+from dlo_calibration.vision.camera import read_lens
+from dlo_calibration.vision.photograph import Photograph, read_photograph
+from dlo_calibration.vision.pose import scale_from_points
+from dlo_calibration.vision.scale import Scale
+from dlo_calibration.vision.tracer import Trace, Tracer, write_picture
 
 LARGEST_DIAMETER = 0.2  # m
 COUNTS = (3, MOST_POINTS)  # of a chain's points
@@ -48,10 +50,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
-    from dlo_calibration.capture.chains import axis_of, measured_diameter
-    from dlo_calibration.capture.photograph import read_photograph
-    from dlo_calibration.capture.trace import Tracer
-
     clicks = np.array([_pair(word, '--points', 'u,v') for word in chosen.points.split()]).reshape(-1, 2)
     _check(chosen)
     photograph = read_photograph(chosen.photograph, f'photograph {chosen.photograph}')
@@ -62,16 +60,21 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     chain, diameter, length, shown = None, None, None, None
     if scale is not None:
         diameter = chosen.diameter or measured_diameter(trace, scale)
-        above = {k: one.first_above for k, one in enumerate(trace.crossings) if one.first_above is not None}
+        above = {k: crossing.first_above for k, crossing in enumerate(trace.crossings)
+                 if crossing.first_above is not None}
         axis = axis_of(trace, scale, diameter, chosen.count, above)
         chain, length = axis.chain(np.linspace(0.0, 1.0, chosen.count)), axis.length
         shown = scale.to_pixels(chain.points)
-    _write(chosen, photograph, trace, chain, shown)
+        if chosen.output is not None:
+            write_chain(chosen.output, chain)
+    if chosen.picture is not None:
+        write_picture(chosen.picture, photograph.pixels, trace, shown)
     if chosen.json:
         print_json({'pixels': trace.pixels.tolist(),
                     'points': None if chain is None else chain.points.tolist(),
                     'length_m': length, 'width_px': trace.width, 'diameter_m': diameter,
-                    'crossings': [list(one.pixel) for one in trace.crossings], 'sure': trace.sure.tolist(),
+                    'crossings': [list(crossing.pixel) for crossing in trace.crossings],
+                    'sure': trace.sure.tolist(),
                     'residual_m': None if scale is None else scale.residual,
                     'notes': [] if scale is None else list(scale.notes), 'seconds': seconds})
     else:
@@ -80,7 +83,7 @@ def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
 
 
 def _check(chosen: argparse.Namespace) -> None:
-    """Refuse values that cannot be meant."""
+    """Refuse values that are out of range, and an output without a scale."""
     if not COUNTS[0] <= chosen.count <= COUNTS[1]:
         raise InputError('--count', str(chosen.count), f'{COUNTS[0]} to {COUNTS[1]}', 'choose a number')
     if chosen.diameter is not None and not 0 < chosen.diameter <= LARGEST_DIAMETER:
@@ -92,26 +95,19 @@ def _check(chosen: argparse.Namespace) -> None:
 
 def _scale(chosen: argparse.Namespace, photograph: Photograph) -> Scale | None:
     """Return the scale that the command line asks for."""
-    from dlo_calibration.capture.board import find_board
-    from dlo_calibration.capture.camera import read_lens
-    from dlo_calibration.capture.pose import scale_from_points
-
     lens = None if chosen.camera is None else read_lens(chosen.camera)
     if chosen.board:
         pixels, table = find_board(photograph.pixels)
     elif chosen.scale:
-        pairs = [_known_point(word) for word in chosen.scale.split()]
-        pixels, table = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
+        pairs = [word.partition('=') for word in chosen.scale.split()]
+        for pair in pairs:
+            if not pair[1]:
+                raise InputError('--scale', repr(pair[0]), 'u,v=x,y',
+                                 'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
+        pixels, table = (np.array([_pair(pair[k], '--scale', 'u,v=x,y') for pair in pairs]) for k in (0, 2))
     else:
         return None
     return scale_from_points(pixels, table, photograph.size, lens, photograph.focal_length)
-
-
-def _known_point(word: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    pixel, equals, place = word.partition('=')
-    if not equals:
-        raise InputError('--scale', repr(word), 'u,v=x,y', 'write e.g. "100,200=0,0 900,210=0.3,0 ..."')
-    return _pair(pixel, '--scale', 'u,v=x,y'), _pair(place, '--scale', 'u,v=x,y')
 
 
 def _pair(word: str, option: str, form: str) -> tuple[float, float]:
@@ -124,21 +120,8 @@ def _pair(word: str, option: str, form: str) -> tuple[float, float]:
     return first, second
 
 
-def _write(chosen: argparse.Namespace, photograph: Photograph, trace: Trace, chain: Chain | None,
-           shown: Floats | None) -> None:
-    """Write the files that the command line asks for."""
-    if chosen.output is not None and chain is not None:
-        from dlo_calibration.files.chain_file import write_chain
-
-        write_chain(chosen.output, chain)
-    if chosen.picture is not None:
-        from dlo_calibration.capture.line_picture import write_picture
-
-        write_picture(chosen.picture, photograph.pixels, trace, shown)
-
-
 def _print(trace: Trace, scale: Scale | None, length: float | None, diameter: float | None) -> None:
-    """Print what was found, for people."""
+    """Print the trace as text."""
     with standard_output() as stream:
         crossings = len(trace.crossings)
         stream.write(f'line of {len(trace.pixels)} pixels, {trace.width:.1f} px wide, sure along '

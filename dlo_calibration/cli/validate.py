@@ -16,14 +16,15 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult, simulated_chains
 from dlo_calibration.calibration.stages import confirmed
-from dlo_calibration.cli.output import print_result, tell
-from dlo_calibration.cli.source import add_source, read_result_file, read_source
+from dlo_calibration.cli.arguments import add_source, read_result_file, selected
+from dlo_calibration.cli.output import print_message, print_result
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.result import Description
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.plausibility import implausible_trials
-from dlo_calibration.observation.rest_lengths import with_shared_places
+from dlo_calibration.workspace.source import read_source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def act(chosen: argparse.Namespace, make_simulator: SimulatorFactory) -> int:
     """Execute the verb; return the exit code."""
     file = read_result_file(chosen)
-    source = read_source(chosen, tell, file.file_options).require_trials()
+    source = read_source(selected(chosen), print_message, file.file_options).require_trials()
     result = validated(file, source.trials, source.options, make_simulator)
     print_result(confirmed(result, source.options, make_simulator), chosen.json)
     return 0
@@ -57,11 +58,12 @@ def validated(file: Description, trials: Sequence[Trial], options: Options,
         seconds = time.monotonic() - begun
     if evaluation.failure:
         raise SimulationError(evaluation.failure)
-    doubts = implausible_trials(trials, options.table_height if options.table else None, bool(options.scene))
-    warnings = (*doubts, *(f'never came to rest: {name}; the last state was compared'
+    implausible = implausible_trials(trials, options.table_top, bool(options.scene))
+    warnings = (*implausible, *(f'never came to rest: {name}; the last state was compared'
                            for name in evaluation.unsettled))
     return CalibrationResult(
         space=file.space, parameters=file.parameters, best=evaluation, trials=trials,
         chains=simulated_chains(trials, evaluation), evaluations=(evaluation,),
         seconds=seconds, search=file.search, engine=simulator.name,
-        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings, doubts=doubts)
+        stop_reason='validation: nothing was fitted', seed=file.seed, warnings=warnings,
+        implausible=implausible)

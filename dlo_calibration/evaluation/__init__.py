@@ -5,15 +5,12 @@
 
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.cluster import ClusterExecutor
-from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.log import EvaluationLog
-from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.log import EvaluationLog, Memory
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.evaluation.process_simulator import ProcessSimulator
-from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 
 __all__ = ['BatchEvaluator', 'ClusterExecutor', 'Evaluation', 'EvaluationLog', 'Evaluator', 'Huber',
            'Linearisation', 'Memory', 'Pool', 'ProcessSimulator', 'ResidualLayout', 'Threads']

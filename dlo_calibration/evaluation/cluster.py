@@ -85,14 +85,14 @@ class ClusterExecutor(Executor):
         future: Future[Any] = Future()
         # Send bytes and a function of Python's library: any worker and the scheduler can unpickle these.  A
         # worker that fails to unpickle a task, e.g. because a module is missing, leaves without an error.
-        self._send(future, _packed(_Call(call, args, keywords), self._kept))
+        self._send(future, _packed(_Call(call, *args, **keywords), self._kept))
         if self._given_up is not None:
             self._fail(future, self._given_up)
         return future
 
     def _send(self, future: Future[Any], packed: bytes) -> None:
         """Let a worker unpickle a call, which makes it, and give its result to a future."""
-        there = self._executor.submit(pickle.loads, packed)
+        there = self._executor.submit(pickle.loads, packed)  # noqa: S301  # a worker unpickles it
         self._pending[future] = there
         future.add_done_callback(lambda done: there.cancel() if done.cancelled() else None)
         there.add_done_callback(lambda _: self._pass_on(future, packed))
@@ -198,14 +198,11 @@ class ClusterExecutor(Executor):
             self._fail(future, reason)
 
 
-class _Call:
+class _Call(partial[Any]):
     """A call that is executed by unpickling it."""
 
-    def __init__(self, call: Callable[..., Any], args: tuple[Any, ...], keywords: Mapping[str, Any]) -> None:
-        self._made = partial(call, **keywords), args
-
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        return self._made
+        return partial(self.func, **self.keywords), self.args
 
 
 def _packed(call: _Call, kept: dict[int, tuple[Any, str, bytes]]) -> bytes:

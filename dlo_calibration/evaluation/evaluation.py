@@ -1,18 +1,24 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Evaluation: the result of one parameter set on all trials."""
+"""Evaluation: the result of one parameter set on all trials; Evaluator: computes it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Mapping
+from typing import Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.score import PointErrors
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.residuals import compared_rows, ResidualLayout
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.score import PointErrors, residuals, TrialScore
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.simulation.protocol import Job, Rollout, simulate_all, Simulator, Stop
 
 
 @dataclass(frozen=True)
@@ -45,3 +51,66 @@ class Evaluation:
     def score(self) -> float:
         """Average difference score over the trials [cm]; infinite if the evaluation failed."""
         return float(np.mean(self.scores)) if self.scores else float('inf')
+
+
+def mean_length(trials: Sequence[Trial]) -> float:
+    """Return the mean length [m] of the initial chains of the trials."""
+    return float(np.mean([trial.initial.length for trial in trials]))
+
+
+class Evaluator:
+    """
+    Tries parameter sets on trials.
+
+    :param every_goal: whether its residuals are those of every goal; if not, they are those of the
+        `compared_goals`. Scores and errors are always those of every goal.
+    """
+
+    def __init__(self, trials: Sequence[Trial], space: ParameterSpace, simulator: Simulator,
+                 every_goal: bool = True) -> None:
+        self.trials = tuple(trials)
+        self.space = space
+        self.simulator = simulator
+        self._rows = None if every_goal else compared_rows(trials)
+        self._length = mean_length(trials)
+        self._scores = tuple(TrialScore(trial) for trial in trials)
+
+    def of(self, space: ParameterSpace) -> Evaluator:
+        """Return an evaluator with other parameters."""
+        other = copy.copy(self)  # what belongs to the trials never changes
+        other.space = space
+        return other
+
+    @property
+    def layout(self) -> ResidualLayout:
+        """The order of its residuals."""
+        return ResidualLayout.of(self.trials) if self._rows is None else ResidualLayout.compared(self.trials)
+
+    def evaluate(self, index: int, point: Floats) -> Evaluation:
+        """Try a (d,) point of the unit cube on every trial, in this thread."""
+        return self.evaluated(index, point, simulate_all(self.simulator, self.jobs(point), Stop()))
+
+    def jobs(self, point: Floats) -> list[Job]:
+        """Return what is simulated at a (d,) point of the unit cube: each trial."""
+        physical = self.space.physical(self.space.values(point), self._length)
+        return [(trial, physical) for trial in self.trials]
+
+    def evaluated(self, index: int, point: Floats, outcomes: Sequence[Rollout | SimulationError]
+                  ) -> Evaluation:
+        """Return the evaluation of a (d,) point from the outcomes of its `jobs`."""
+        evaluation = Evaluation(index, frozen_array(point), self.space.values(point))
+        rollouts: list[Rollout] = []
+        for rollout in outcomes:
+            if isinstance(rollout, SimulationError):
+                return replace(evaluation, failure=str(rollout),
+                               skipped=len(self.trials) - len(rollouts) - 1)
+            rollouts.append(rollout)
+        evaluation = replace(
+            evaluation, scores=tuple(float(score(rollout.chains))
+                                     for score, rollout in zip(self._scores, rollouts, strict=True)),
+            unsettled=tuple(trial.name for trial, rollout in zip(self.trials, rollouts, strict=True)
+                            if not all(rollout.settled)))
+        residual = np.concatenate([residuals(trial, rollout.chains)
+                                   for trial, rollout in zip(self.trials, rollouts, strict=True)])
+        kept = residual if self._rows is None else residual[self._rows]
+        return replace(evaluation, errors=PointErrors.of(residual), residuals=frozen_array(kept))

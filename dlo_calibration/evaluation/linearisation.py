@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
+from operator import itemgetter
 from typing import Iterable, Sequence, Union
 
 import numpy as np
@@ -19,6 +21,7 @@ WIDEST = 0.25  # largest, for parameters that are hardly known; the linear model
 TINY = float(np.finfo(float).tiny)  # keeps a divisor above zero
 
 Rows = Union[slice, NDArray[np.intp]]  # of a Jacobian: a trial's, or those of several trials
+Columns = Union[Sequence[int], NDArray[np.intp]]  # of a Jacobian, by their indices
 
 
 @dataclass(frozen=True)
@@ -102,31 +105,69 @@ def perpendicular(columns: Floats, vector: Floats) -> Floats:
     return np.asarray(vector - basis @ (basis.T @ vector))
 
 
-def inward(point: Floats, steps: Floats) -> Floats:
-    """Return (d,) steps from a (d,) point, with the sign changed where they would leave the unit cube."""
-    return np.where((point + steps > 1) | (point + steps < 0), -steps, steps)
-
-
-def both_sides(point: Floats, columns: Iterable[int | np.intp], steps: Floats) -> Floats:
-    """Return (2 k, d) points below and above a (d,) point in each of k parameters, within the unit cube."""
-    beside = []
-    for k in columns:
-        for step in (-steps[k], steps[k]):
-            beside.append(point.copy())
-            beside[-1][k] = min(max(point[k] + step, 0.0), 1.0)
-    return np.array(beside).reshape(-1, len(point))
-
-
-def slope(values: Iterable[float], seen: Sequence[Floats | None]) -> Floats | None:
+def broyden(jacobian: Floats, step: Floats, surprise: Floats) -> Floats:
     """
-    Return the (m,) difference quotient between the smallest and the largest value of a parameter.
+    Return an (m, d) Jacobian updated after a (d,) step (Broyden's rank-one update).
 
-    :param seen: the (m,) residuals at each value; None if the simulation failed, and the value is left out.
-    :returns: None if fewer than two different values are left.
+    Nocedal and Wright, Numerical Optimization, 2nd ed., 11.1.
+
+    :param surprise: (m,) by how much the residuals after the step differ from those it predicted [m].
     """
-    known = [(float(value), one) for value, one in zip(values, seen, strict=True) if one is not None]
-    if not known:
-        return None
-    low, before = min(known, key=lambda one: one[0])
-    high, after = max(known, key=lambda one: one[0])
-    return np.asarray((after - before) / (high - low)) if high > low else None
+    return np.asarray(jacobian + np.outer(surprise, step / (step @ step)))
+
+
+@dataclass(frozen=True)
+class Differences:
+    """
+    Finite differences near a point: the points to evaluate, and the derivatives that they give.
+
+    :param point: (d,).
+    :param columns: indices of the k parameters that are varied.
+    :param beside: for each of them, (p, d) points that differ from `point` in it alone.
+    """
+
+    point: Floats
+    columns: Columns
+    beside: Sequence[Floats]
+
+    @classmethod
+    def one_sided(cls, point: Floats, columns: Columns, steps: Floats) -> Differences:
+        """Return those with one point for each of k parameters, at its signed one of (d,) steps."""
+        beside = np.tile(point, (len(columns), 1))
+        beside[np.arange(len(columns)), columns] += steps[columns]
+        return cls(point, columns, [row[None] for row in beside])
+
+    @classmethod
+    def central(cls, point: Floats, columns: Columns, steps: Floats) -> Differences:
+        """Return those with a point below and one above in each of k parameters, within the unit cube."""
+        pairs = []
+        for k in columns:
+            pairs.append(np.stack([point, point]))
+            pairs[-1][:, k] = np.clip(point[k] + np.array([-steps[k], steps[k]]), 0.0, 1.0)
+        return cls(point, columns, pairs)
+
+    @property
+    def points(self) -> Floats:
+        """The (n, d) points to evaluate, those of each parameter in turn."""
+        return np.concatenate([np.zeros((0, len(self.point))), *self.beside])
+
+    def jacobian(self, before: Floats, residuals: Iterable[Floats | None], here: Floats | None = None
+                 ) -> Floats:
+        """
+        Return an (m, d) Jacobian with the columns that the differences give, and the others of `before`.
+
+        A column is the difference quotient between the smallest and the largest value of its parameter.
+
+        :param residuals: the (m,) residuals at each of `points`; None where the simulation failed.
+        :param here: (m,) those at `point`, which stand in for a failed side; None: they are not used.
+        """
+        jacobian, each = before.copy(), iter(residuals)
+        for k, beside in zip(self.columns, self.beside, strict=True):
+            values = (self.point[k], *beside[:, k])
+            known = [(value, seen) for value, seen in zip(
+                values, (here, *islice(each, len(beside))), strict=True) if seen is not None]
+            low, at_low = min(known, key=itemgetter(0), default=(0.0, np.nan))
+            high, at_high = max(known, key=itemgetter(0), default=(0.0, np.nan))
+            if high > low:
+                jacobian[:, k] = (at_high - at_low) / (high - low)
+        return jacobian

@@ -1,30 +1,41 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""EvaluationLog: a file with what has been simulated, so that a killed calibration can go on."""
+"""
+EvaluationLog: a file with everything that was simulated; Memory: does not simulate that again.
+
+A calibration that was killed goes on from there.
+"""
 
 from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Mapping  # that of typing makes isinstance ten times slower
-from dataclasses import dataclass, fields, is_dataclass
+from contextlib import suppress
+from dataclasses import astuple, dataclass, fields, replace
 import fcntl
 from hashlib import blake2b
 import os
 from pathlib import Path
 import stat
-from typing import Any
+import threading
+from typing import Callable, Sequence
 
 import numpy as np
 
-from dlo_calibration.errors import InputError
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.digest import digest
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.model.score import PointErrors
+from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.simulation.protocol import Job, Rollout
 
 LONGEST = 2**25  # bytes of a line: 3 million residuals; reading a line must not take all memory
 MOST = 1000000  # entries; a stranger's file must not take all memory, and `evaluations` allows no more
 #: Kinds of entries: an evaluation, a rollout, and the calibration to which all of them belong.
 EVALUATION, ROLLOUT, CALIBRATION = 'evaluation', 'rollout', 'calibration'
+ERRORS = len(fields(PointErrors))
 
 
 @dataclass(frozen=True)
@@ -44,8 +55,8 @@ class EvaluationLog:
     A file to which each finished evaluation is appended, one line each.
 
     A line has a key, numbers, a text and a check sum. A line that is cut or damaged is ignored, as a
-    killed process or a bad disk may leave it. A line survives the end of the process, for whatever
-    reason; what the operating system itself has not written yet is lost if the power fails.
+    killed process or a bad disk may leave it. A written line survives any end of the process, but not
+    a power failure before the operating system has written it to disk.
 
     Only one process can have a log open. It is not thread-safe.
 
@@ -68,15 +79,13 @@ class EvaluationLog:
             self._places: dict[str, tuple[int, int]] = {}  # key -> first byte of its line, number of bytes
             self._cut = False  # whether the file ends within a line
             self._read()
-        except BlockingIOError as error:
+        except BaseException as error:
             os.close(self._file)
-            raise InputError(f'log {self.path}', 'a log that another calibration is using', 'one at a time',
-                             'wait until that calibration has ended') from error
-        except OSError as error:
-            os.close(self._file)
-            raise self._unusable(str(error)) from error
-        except BaseException:
-            os.close(self._file)
+            if isinstance(error, BlockingIOError):
+                raise InputError(f'log {self.path}', 'a log that another calibration is using',
+                                 'one at a time', 'wait until that calibration has ended') from error
+            if isinstance(error, OSError):
+                raise self._unusable(str(error)) from error
             raise
 
     @property
@@ -86,7 +95,7 @@ class EvaluationLog:
 
     @property
     def resumed(self) -> str:
-        """A sentence for the user of a calibration that goes on with it; empty if it holds no evaluation."""
+        """What to tell the user of a calibration that resumes with it; '' if it has no evaluation."""
         count = self.evaluations
         return f'goes on after {count} evaluations of an interrupted calibration' if count else ''
 
@@ -99,8 +108,8 @@ class EvaluationLog:
         if key not in self._places:
             return None
         place, count = self._places[key]
-        found = _parsed(os.pread(self._file, count, place))
-        return found[1] if found is not None and found[0] == key else None
+        line = _parsed(os.pread(self._file, count, place))
+        return line[1] if line is not None and line[0] == key else None
 
     def add(self, key: str, entry: Entry) -> None:
         """
@@ -145,9 +154,9 @@ class EvaluationLog:
             place = 0
             while line := stream.readline(LONGEST):
                 self._cut = not line.endswith(b'\n')
-                found = _parsed(line)
-                if found is not None and len(self._places) < MOST:
-                    self._places[found[0]] = place, len(line)
+                parsed = _parsed(line)
+                if parsed is not None and len(self._places) < MOST:
+                    self._places[parsed[0]] = place, len(line)
                 place += len(line)
         os.lseek(self._file, 0, os.SEEK_END)
 
@@ -181,41 +190,140 @@ def _check_sum(body: bytes) -> bytes:
     return blake2b(body, digest_size=8).hexdigest().encode()
 
 
-def digest(*things: Any) -> str:
+class Memory:
     """
-    Return a digest of values, arrays and dataclasses that is the same in any process and on any machine.
+    What a calibration simulated before it was interrupted: new results are added to it.
 
-    :raises TypeError: for a thing of another type.
+    :param log: None: nothing is remembered.
+    :param engine: digest of the engine's settings.
+    :param on_failure: called once, with a sentence, if the log can no longer be written.
     """
-    state = blake2b(digest_size=16)
-    _feed(state, things)
-    return state.hexdigest()
+
+    def __init__(self, log: EvaluationLog | None = None, engine: str = '',
+                 on_failure: Callable[[str], None] = lambda _: None) -> None:
+        self._log, self._engine, self._on_failure = log, engine, on_failure
+        self._full = False
+        self._writing = threading.Lock()  # the threads that simulate also write
+        self._digests: dict[int, tuple[Trial | Goal, str]] = {}
+
+    def of(self, evaluator: Evaluator, finer: bool = False) -> EvaluatorMemory:
+        """
+        Return the memory of an evaluator's points.
+
+        :param finer: whether its simulator is the engine's refined one.
+        """
+        base = '' if self._log is None else digest(
+            self._engine, evaluator.simulator.name, finer, [self.digest(trial) for trial in evaluator.trials],
+            evaluator.space, evaluator.layout)
+        return EvaluatorMemory(self, base, evaluator)
+
+    def rollout(self, simulator: str, job: Job) -> Rollout | SimulationError | None:
+        """Return the rollout of a job by a simulator of this name, or why it failed; None if it is new."""
+        entry = None if self._log is None else self.find(self._key(simulator, job))
+        if entry is None:
+            return None
+        goals, points, numbers = len(job[0].goals), len(job[0].initial), entry.numbers
+        if not len(numbers):
+            return SimulationError(entry.text)
+        if len(numbers) != 2 + goals + 3 * goals * points:  # a stranger's entry
+            return None
+        settled = tuple(bool(flag) for flag in numbers[2:2 + goals])
+        return Rollout(np.reshape(numbers[2 + goals:], (goals, points, 3)), settled, float(numbers[0]),
+                       int(numbers[1]))
+
+    def add_rollouts(self, simulator: str, jobs: Sequence[Job], rollouts: list[Rollout | SimulationError]
+                     ) -> list[Rollout | SimulationError]:
+        """Remember the rollouts of jobs, and return them."""
+        if self._log is not None:
+            for job, rollout in zip(jobs, rollouts, strict=True):
+                entry = Entry(np.zeros(0), str(rollout)) if isinstance(rollout, SimulationError) else Entry(
+                    np.array([rollout.duration, rollout.steps, *rollout.settled, *rollout.chains.ravel()]))
+                self.add(self._key(simulator, job), entry)
+        return rollouts
+
+    def _key(self, simulator: str, job: Job) -> str:
+        return f'{ROLLOUT}-{digest(self._engine, simulator, self.digest(job[0]), job[1])}'
+
+    def digest(self, trial: Trial) -> str:
+        """Return the digest of a trial; computed once, as trials may share hundreds of goals."""
+        if id(trial) not in self._digests:
+            others = {one.name: getattr(trial, one.name) for one in fields(trial) if one.name != 'goals'}
+            self._digests[id(trial)] = trial, digest(others, [self._goal(goal) for goal in trial.goals])
+        return self._digests[id(trial)][1]
+
+    def _goal(self, goal: Goal) -> str:
+        if id(goal) not in self._digests:
+            self._digests[id(goal)] = goal, digest(goal)  # with the goal, so that no other one gets its id
+        return self._digests[id(goal)][1]
+
+    def find(self, key: str) -> Entry | None:
+        """Return the entry with a key; None if there is none."""
+        with suppress(OSError):  # what cannot be read is simulated again
+            return None if self._log is None else self._log.find(key)
+        return None
+
+    def add(self, key: str, entry: Entry) -> None:
+        """Write an entry, unless an earlier one could not be written."""
+        with self._writing:
+            if self._log is None or self._full:
+                return
+            try:
+                self._log.add(key, entry)
+            except OSError as error:
+                self._full = True
+                self._on_failure(f'log {self._log.path}: cannot be written: {error}; the calibration goes '
+                                 'on, but if it is interrupted, the evaluations from here on are lost')
 
 
-def _feed(state: Any, thing: Any) -> None:
-    """Feed a thing to a hash: its type, its length, and its content."""
-    if isinstance(thing, np.generic):
-        thing = thing.item()
-    if thing is None or isinstance(thing, (bool, int, float, str, bytes)):  # most things, so they come first
-        kind = thing.hex() if isinstance(thing, float) else thing
-        octets = thing if isinstance(thing, bytes) else str(kind).encode('utf-8', 'surrogatepass')
-        state.update(f'{type(thing).__name__}{len(octets)}:'.encode() + octets)
-    elif is_dataclass(thing) and not isinstance(thing, type):
-        name = type(thing).__name__
-        _feed(state, {f'{name}.{one.name}': getattr(thing, one.name) for one in fields(thing)})
-    elif isinstance(thing, np.ndarray):
-        thing = np.ascontiguousarray(thing, thing.dtype.newbyteorder('<'))
-        if thing.dtype.hasobject:
-            raise TypeError('an array of objects has no digest')
-        _feed(state, (thing.dtype.str, thing.shape))
-        state.update(thing.tobytes())
-    elif isinstance(thing, Mapping):
-        state.update(f'{{{len(thing)}:'.encode())
-        for name in sorted(thing):
-            _feed(state, (name, thing[name]))
-    elif isinstance(thing, (tuple, list)):
-        state.update(f'({len(thing)}:'.encode())
-        for one in thing:
-            _feed(state, one)
-    else:
-        raise TypeError(f'a {type(thing).__name__} has no digest')
+class EvaluatorMemory:
+    """
+    The evaluations of one evaluator.
+
+    :param base: digest of all that an evaluation depends on, except the point; empty: nothing is remembered.
+    """
+
+    def __init__(self, memory: Memory, base: str, evaluator: Evaluator) -> None:
+        self._memory, self._base = memory, base
+        self._trials, self._space = evaluator.trials, evaluator.space
+        self._size = evaluator.layout.rows[-1].stop
+
+    def find(self, index: int, point: Floats) -> Evaluation | None:
+        """Return the evaluation of a (d,) point of the unit cube; None if there is none."""
+        entry = self._memory.find(self._key(point)) if self._base else None
+        if entry is None:
+            return None
+        count, numbers = len(self._trials), entry.numbers
+        evaluation = Evaluation(index, frozen_array(point), self._space.values(point))
+        if len(numbers) == 1 and numbers[0] in range(count):
+            return replace(evaluation, failure=entry.text, skipped=int(numbers[0]))
+        if len(numbers) != 2 * count + ERRORS + self._size:  # a stranger's entry
+            return None
+        unsettled, scores, errors, residuals = np.split(numbers, np.cumsum([count, count, ERRORS]))
+        return replace(
+            evaluation, scores=tuple(scores.tolist()), errors=PointErrors(*errors.tolist()),
+            residuals=frozen_array(residuals),
+            unsettled=tuple(trial.name for trial, flag in zip(self._trials, unsettled, strict=True) if flag))
+
+    def add(self, evaluation: Evaluation) -> None:
+        """Remember a finished evaluation."""
+        if not self._base:
+            return
+        if evaluation.residuals is None or evaluation.errors is None:
+            entry = Entry(np.array([float(evaluation.skipped)]), evaluation.failure)
+        else:
+            entry = Entry(np.concatenate([
+                _flags(self._trials, evaluation.unsettled), evaluation.scores, astuple(evaluation.errors),
+                evaluation.residuals]))
+        self._memory.add(self._key(evaluation.point), entry)
+
+    def _key(self, point: Floats) -> str:
+        return f'{EVALUATION}-{digest(self._base, np.asarray(point, float))}'
+
+
+def _flags(trials: Sequence[Trial], names: Sequence[str]) -> list[float]:
+    """Return 1 for each trial that `names` contain, in the same order, and 0 for the others."""
+    flags, left = [], list(names)
+    for trial in trials:
+        flags.append(float(left[:1] == [trial.name]))
+        left = left[int(flags[-1]):]
+    return flags

@@ -15,7 +15,7 @@ import threading
 from typing import Callable, Sequence, TypeVar
 
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.evaluation.memory import Memory
+from dlo_calibration.evaluation.log import Memory
 from dlo_calibration.simulation.protocol import (
     Job,
     Rollout,
@@ -66,8 +66,8 @@ class Pool:
     Rollouts come in the order of the jobs, and do not depend on the number of workers.
 
     :param executor: its workers simulate: `Threads`, or a `ClusterExecutor`; None: one thread.
-    :param should_stop: asked often while somebody waits; once it is True, the pool stops.
-    :param memory: has the rollouts that need not be simulated again, and gets the new ones.
+    :param should_stop: polled while a caller waits; once it returns True, the pool stops.
+    :param memory: holds earlier rollouts, which are not simulated again, and stores the new ones.
     """
 
     def __init__(self, simulator: Simulator, executor: Executor | None = None,
@@ -91,8 +91,8 @@ class Pool:
     def stop(self) -> None:
         """End all rollouts; whoever waits for one gets a CancelledError."""
         self._stop.set()
-        for one in list(self._under_way):
-            one.cancel()
+        for future in list(self._under_way):
+            future.cancel()
 
     def portion(self, jobs: int) -> int:
         """Return how many of so many jobs one worker should simulate in one call."""
@@ -104,7 +104,7 @@ class Pool:
         """
         Begin to simulate jobs in one call of a worker; `result` waits for it.
 
-        :param then: makes of the rollouts what the future gives, as soon as they are finished.
+        :param then: turns the rollouts into the result of the future, as soon as they are finished.
         """
         outcome: Future[Outcome] = Future()
         under_way = self._executor.submit(simulate_all, self.simulator, jobs, self._stop)
@@ -136,22 +136,18 @@ class Pool:
         raise CancelledError
 
     def begin(self, jobs: Sequence[Job]) -> Callable[[], list[Rollout | SimulationError]]:
-        """Begin to simulate jobs, on all workers; return what waits for them, as `simulate` does."""
+        """Begin to simulate jobs on all workers; return a function that waits for what `simulate` returns."""
         name = self.simulator.name
-        found = [self._memory.rollout(name, job) for job in jobs]
-        new = [k for k, one in enumerate(found) if one is None]
-        size, begun = self.portion(len(new)), []
+        rollouts = [self._memory.rollout(name, job) for job in jobs]
+        new = [k for k, rollout in enumerate(rollouts) if rollout is None]
+        size, futures = self.portion(len(new)), []
         for first in range(0, len(new), size):
-            some = new[first:first + size]
-            asked = [jobs[k] for k in some]
-            begun.append((some, self.submit(asked, partial(self._memory.add_rollouts, name, asked))))
+            portion = [jobs[k] for k in new[first:first + size]]
+            futures.append(self.submit(portion, partial(self._memory.add_rollouts, name, portion)))
 
         def ended() -> list[Rollout | SimulationError]:
-            for some, future in begun:
-                rollouts = self.result(future)
-                for k, one in zip(some, rollouts, strict=True):
-                    found[k] = one
-            return [one for one in found if one is not None]
+            simulated = iter([rollout for future in futures for rollout in self.result(future)])
+            return [next(simulated) if rollout is None else rollout for rollout in rollouts]
 
         return ended
 

@@ -4,7 +4,10 @@
 """
 ProcessSimulator: a simulator in a process of its own, which may crash or hang without harm.
 
-PyBullet needs that: it holds Python's lock all the time, and a stranger's scene may crash it.
+PyBullet needs this: it holds Python's lock all the time, and a stranger's scene may crash it.  A
+ProcessPoolExecutor is broken for good when a process dies, and can neither stop a call nor replace a process
+that hangs; pebble's limit is on the whole call, but a long rollout that still makes progress must go on: the
+heartbeat here measures only the time in which native code does not return.
 """
 
 from __future__ import annotations
@@ -21,11 +24,11 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any, Callable, Mapping, NoReturn, Sequence
+from typing import Any, Callable, NoReturn, Sequence
 
 from dlo_calibration.errors import DloCalibrationError, SimulationError
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_one, Simulator, Stop
+from dlo_calibration.simulation.protocol import Job, Rollout, Simulator, Stop, TogetherSimulator
 
 DEATHS = 3  # processes that may end at the same rollout before it fails
 HANGING = 1  # exit code of `faulthandler`
@@ -34,7 +37,7 @@ MOST_TRIALS = 1000  # that a process keeps
 PROGRAM = 'import sys; sys.path[:] = {path}; from {module} import work; work({number}, {limit})'
 
 
-class ProcessSimulator:
+class ProcessSimulator(TogetherSimulator):
     """
     A simulator in a process of its own, one for each thread that calls it at the same time.
 
@@ -59,17 +62,12 @@ class ProcessSimulator:
         """Start a process now, which loads the simulator while this one does something else."""
         self._idle.append(self._process())
 
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        """
-        Simulate a trial with physical parameters by name (SI units).
-
-        :raises SimulationError: if the rollout diverges.
-        :raises DloCalibrationError: if its process ends unexpectedly `DEATHS` times.
-        """
-        return simulate_one(self, (trial, physical))
-
     def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
-        """Simulate one job after the other; see `TogetherSimulator`."""
+        """
+        Simulate one job after the other; see `TogetherSimulator`.
+
+        :raises DloCalibrationError: if a process ends unexpectedly `DEATHS` times at the same job.
+        """
         return [self._simulated(job, stop) for job in jobs]
 
     def refined(self) -> ProcessSimulator:
@@ -91,9 +89,9 @@ class ProcessSimulator:
             except IndexError:
                 process = self._process()
             try:
-                found = process.simulated(job, stop)
+                outcome = process.simulated(job, stop)
             except (EOFError, OSError):
-                ending, remedy = self._ending(process.end(patience=10.0), process.silence)
+                ending, remedy = self._ending(process.end(patience=10.0), time.monotonic() - process.asked)
                 logging.getLogger(__name__).warning(
                     'a process that simulates the %s %s; its rollout is repeated', self._content, ending)
             except BaseException:
@@ -101,9 +99,9 @@ class ProcessSimulator:
                 raise
             else:
                 self._idle.append(process)
-                if isinstance(found, (Rollout, SimulationError)):
-                    return found
-                raise found
+                if isinstance(outcome, (Rollout, SimulationError)):
+                    return outcome
+                raise outcome
         raise DloCalibrationError(
             f'the {self._content} could not be simulated: {DEATHS} processes one after the other ended '
             f'unexpectedly at the same evaluation, the last one {ending}; {remedy}')
@@ -143,7 +141,7 @@ class _Process:
         finally:
             there.close()
         self._sent: dict[int, tuple[Trial, int]] = {}
-        self._asked = time.monotonic()
+        self.asked = time.monotonic()  # [s] when the last job was sent
         self._channel.send((make, finer))
 
     def simulated(self, job: Job, stop: Stop) -> Any:
@@ -158,17 +156,12 @@ class _Process:
             self._sent.clear()
         known = id(trial) in self._sent
         _, number = self._sent.setdefault(id(trial), (trial, len(self._sent)))
-        self._asked = time.monotonic()
+        self.asked = time.monotonic()
         self._channel.send((number, None if known else trial, dict(physical)))
         while not self._channel.poll(PERIOD):
             if stop.is_set():
                 raise CancelledError
         return self._channel.recv()
-
-    @property
-    def silence(self) -> float:
-        """Time since the last job was sent [s]."""
-        return time.monotonic() - self._asked
 
     def end(self, patience: float = 0.0) -> int:
         """End the process; return its exit code. If it ends itself, wait for that, for `patience` [s]."""
@@ -197,7 +190,7 @@ def work(number: int, answer_limit: float) -> None:
             for _ in range(finer):
                 simulator = simulator.refined() or simulator
             made = simulator
-        except Exception as error:  # the first rollout tells it
+        except Exception as error:  # raised by the first rollout
             made = error
         trials: dict[int, Trial] = {}
         while True:
@@ -220,9 +213,9 @@ def work(number: int, answer_limit: float) -> None:
 
 def _watch(end_later: Callable[[], None], period: float, parent: int) -> NoReturn:
     """
-    Put the end of the process off, again and again [s], until its parent has ended.
+    Heartbeat: put off the end of the process at each `period` [s], until its parent has ended.
 
-    Native code that hangs holds Python's lock, so that this thread cannot put it off any more.
+    Native code that hangs holds Python's lock, so that this thread can no longer put it off.
     """
     while os.getppid() == parent:
         end_later()

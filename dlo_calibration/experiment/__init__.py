@@ -3,9 +3,7 @@
 
 """The paper's experiment: measures how consistent and how valid the found parameters are."""
 
-from dlo_calibration.experiment.conduct import Plan
 from dlo_calibration.experiment.journal import Journal
-from dlo_calibration.experiment.outcome import Outcome
-from dlo_calibration.experiment.study import Subject, Task
+from dlo_calibration.experiment.study import Outcome, Study, Subject, Task
 
-__all__ = ['Journal', 'Outcome', 'Plan', 'Subject', 'Task']
+__all__ = ['Journal', 'Outcome', 'Study', 'Subject', 'Task']

@@ -6,61 +6,24 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
 import functools
 import json
+from operator import itemgetter
 from pathlib import Path
 from typing import Callable, Sequence, TextIO
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.errors import InputError
 from dlo_calibration.experiment import tables
-from dlo_calibration.experiment.journal import Journal
-from dlo_calibration.experiment.outcome import judged_chains, Outcome, perform
-from dlo_calibration.experiment.performing import perform_all
-from dlo_calibration.experiment.study import Subject, Task, tasks
+from dlo_calibration.experiment.journal import performed
+from dlo_calibration.experiment.study import judged_chains, Outcome, perform, Study, Subject, Task
 from dlo_calibration.experiment.summary import complete_runs, run_score, summary
 from dlo_calibration.report.drawing import session_picture
-from dlo_calibration.search import SEARCHES
 from dlo_calibration.writing import Attempts, make_folder, whole
 
 JOURNAL = 'calibrations.jsonl'  # in the folder of an experiment
 
 
-@dataclass(frozen=True)
-class Plan:
-    """
-    What an experiment does.
-
-    :param runs: calibrations of each subject with each search, each with its own seed.
-    :param seed: of the first run.
-    :param workers: threads; 0: one per core.
-    :param command: the command that repeats the experiment.
-    :param samples: whether the subjects are the samples of the package.
-    """
-
-    subjects: tuple[Subject, ...]
-    searches: tuple[str, ...]
-    runs: int
-    seed: int
-    workers: int
-    command: str
-    samples: bool
-
-    def __post_init__(self) -> None:
-        if self.runs < 1:
-            raise InputError('--runs', str(self.runs), '1 or more', 'correct it')
-        if not self.searches:
-            raise InputError('--search', 'no name', f'one or more of {", ".join(SEARCHES)}', 'name one')
-
-    @property
-    def evaluations(self) -> dict[str, int]:
-        """Largest number of evaluations of a calibration, by search."""
-        return {search: max(one.observed.options_of(search, self.seed).evaluations for one in self.subjects)
-                for search in self.searches}
-
-
-def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
+def conduct(study: Study, folder: Path, make_simulator: SimulatorFactory, stop: Callable[[], bool],
             note: Callable[[str], None], stream: TextIO) -> tuple[tables.Account | None, Attempts]:
     """
     Perform the calibrations whose outcome is not in `folder` yet, then write tables and pictures of all.
@@ -73,22 +36,20 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
     :raises InputError: if `folder` cannot be made, or its journal cannot be read.
     """
     make_folder(folder)
-    attempts, journal = Attempts(folder), Journal(folder / JOURNAL, Outcome.of)
-    engines = {subject.name: _engine(subject, make_simulator) for subject in plan.subjects}
-    wanted = list(tasks(plan.subjects, plan.searches, plan.runs, plan.seed, engines))
-    perform_all('calibrations', wanted, journal, functools.partial(perform, make_simulator=make_simulator),
-                plan.workers, stop, note, stream)
-    if journal.failure:
-        attempts.fail(f'the end of {JOURNAL}', journal.failure)
-    done = [(task, outcome) for task in wanted if (outcome := journal.find(task)) is not None]
-    groups = [group for subject in plan.subjects for search in plan.searches
-              if complete_runs(group := [one for one in done if one[0].subject is subject
-                                         and one[0].search == search])]
+    attempts = Attempts(folder)
+    engines = {subject.name: _engine(subject, make_simulator) for subject in study.subjects}
+    wanted = list(study.tasks(engines))
+    done = performed('calibrations', wanted, folder / JOURNAL, Outcome.of,
+                     functools.partial(perform, make_simulator=make_simulator), study.workers, attempts, stop,
+                     note, stream)
+    groups = [group for subject in study.subjects for search in study.searches
+              if complete_runs(group := [(task, outcome) for task, outcome in done
+                                         if task.subject is subject and task.search == search])]
     if not groups:
         return None, attempts
     account = tables.Account(
-        tuple(summary(group) for group in groups), plan.command, ', '.join(dict.fromkeys(engines.values())),
-        plan.runs, plan.evaluations, plan.samples, complete=len(done) == len(wanted))
+        tuple(summary(group) for group in groups), study.command, ', '.join(dict.fromkeys(engines.values())),
+        study.runs, study.evaluations, study.samples, complete=len(done) == len(wanted))
     _write_all(account, groups, done, make_simulator, attempts)
     if not attempts.failure:
         note(f'tables and pictures are in {folder}')
@@ -99,7 +60,7 @@ def conduct(plan: Plan, folder: Path, make_simulator: SimulatorFactory, stop: Ca
 
 
 def _engine(subject: Subject, make_simulator: SimulatorFactory) -> str:
-    """Return the name of the engine for an object."""
+    """Return the name of the engine that simulates an object."""
     with closing(make_simulator(subject.observed.options)) as simulator:
         return simulator.name
 
@@ -126,13 +87,13 @@ def _write_all(account: tables.Account, groups: Sequence[Sequence[tuple[Task, Ou
 
 def _draw(group: Sequence[tuple[Task, Outcome]], path: Path, make_simulator: SimulatorFactory) -> None:
     """Draw the trials that judge a run, for the run with the median score."""
-    scored = sorted(((score, found) for found in complete_runs(group)
-                     if (score := run_score(found)) is not None), key=lambda one: one[0])
+    scored = sorted(((score, run) for run in complete_runs(group)
+                     if (score := run_score(run)) is not None), key=itemgetter(0))
     if not scored:
         return
-    _, found = scored[(len(scored) - 1) // 2]
-    shown = [one for task, outcome in found if not outcome.failure
-             for one in judged_chains(task, outcome, make_simulator)]
+    _, run = scored[(len(scored) - 1) // 2]
+    shown = [pair for task, outcome in run if not outcome.failure
+             for pair in judged_chains(task, outcome, make_simulator)]
     if shown:
         trials, chains = zip(*shown, strict=True)
         session_picture(trials, chains, path)

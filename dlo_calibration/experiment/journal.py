@@ -5,14 +5,19 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from errno import EEXIST
 import json
 import os
 from pathlib import Path
-from typing import Any, Callable, Generic, Mapping, Protocol, TypeVar
+import threading
+import time
+from typing import Any, Callable, Generic, Iterator, Mapping, Protocol, Sequence, TextIO, TypeVar
 
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.pool import cores, PERIOD
+from dlo_calibration.writing import Attempts
 
 Done = TypeVar('Done')
 
@@ -45,12 +50,14 @@ class Journal(Generic[Done]):
         self._path = path
         self.failure = ''
         self._outcomes: dict[str, Done] = {}
-        if path.is_symlink() or (path.exists() and not path.is_file()):  # a FIFO would block for ever
-            raise self._unusable(OSError(EEXIST, 'something that is no file has this name'))
         try:
+            if path.is_symlink() or (path.exists() and not path.is_file()):  # a FIFO would block for ever
+                raise OSError(EEXIST, 'something that is no file has this name')
             text = path.read_text(encoding='utf-8', errors='replace') if path.exists() else ''
         except OSError as error:
-            raise self._unusable(error) from error
+            raise InputError(f'file {path}', error.strerror or str(error),
+                             'a file that can be read and written', 'choose another folder with --output'
+                             ) from error
         for line in text.splitlines():
             try:
                 entry = json.loads(line)
@@ -78,6 +85,70 @@ class Journal(Generic[Done]):
             self._cut = False
         self._outcomes[task.key] = outcome
 
-    def _unusable(self, error: OSError) -> InputError:
-        return InputError(f'file {self._path}', error.strerror or str(error),
-                          'a file that can be read and written', 'choose another folder with --output')
+NOTE_PERIOD = 30.0  # s between two sentences on what is left, in a log file
+
+AnyTask = TypeVar('AnyTask', bound=Recorded)
+
+
+def performed(what: str, tasks: Sequence[AnyTask], path: Path, of: Callable[[Mapping[str, Any]], Done],
+              perform: Callable[..., Done], workers: int, attempts: Attempts, stop: Callable[[], bool],
+              note: Callable[[str], None], stream: TextIO) -> list[tuple[AnyTask, Done]]:
+    """
+    Perform the tasks that a journal lacks, each in one thread, and return all tasks that are done.
+
+    Each outcome is written at once.  It ends early if it is stopped, or if an outcome cannot be written.
+
+    :param what: the tasks are called.
+    :param path: of the journal; `of` builds its outcomes, see `Journal`.
+    :param perform: called with a task and the keyword `should_stop`; returns its outcome, or raises
+        CancelledError once `should_stop` is True.
+    :param workers: threads; 0: one per core.
+    :param attempts: gets the journal as a failure if it cannot be written.
+    :param note: called with each sentence for the user.
+    :param stream: for a progress bar.
+    :raises InputError: if the journal cannot be read.
+    """
+    from dlo_calibration.report.terminal import TaskBar
+
+    journal, total = Journal(path, of), len(tasks)
+    waiting = [task for task in tasks if journal.find(task) is None]
+    if 0 < len(waiting) < total:
+        note(f'{total - len(waiting)} of {total} {what} are done already')
+    begun = noted = time.monotonic()
+    if waiting:
+        with TaskBar(what, total, total - len(waiting), stream) as bar:
+            outcomes = _outcomes(waiting, perform, min(workers or cores(), len(waiting)), stop)
+            for count, (task, outcome) in enumerate(outcomes, start=1):
+                journal.add(task, outcome)
+                if journal.failure:
+                    attempts.fail(f'the end of {path.name}', journal.failure)
+                    break
+                bar.advance()
+                now = time.monotonic()
+                if not bar.shown and now - noted > NOTE_PERIOD:
+                    noted = now
+                    left = (now - begun) / count * (len(waiting) - count)
+                    note(f'{total - len(waiting) + count} of {total} {what}; {left:.0f} s left')
+    return [(task, known) for task in tasks if (known := journal.find(task)) is not None]
+
+
+def _outcomes(waiting: Sequence[AnyTask], perform: Callable[..., Done], workers: int,
+              stop: Callable[[], bool]) -> Iterator[tuple[AnyTask, Done]]:
+    """Yield each task with its outcome when it is done; end early if stopped."""
+    ended = threading.Event()
+
+    def should_stop() -> bool:
+        return ended.is_set() or stop()
+
+    with ThreadPoolExecutor(workers) as executor:
+        try:
+            futures: dict[Future[Done], AnyTask] = {
+                executor.submit(perform, task, should_stop=should_stop): task for task in waiting}
+            while futures and not stop():
+                for future in wait(futures, PERIOD, FIRST_COMPLETED).done:
+                    yield futures.pop(future), future.result()
+        except CancelledError:  # a task was stopped
+            return
+        finally:
+            ended.set()
+            executor.shutdown(cancel_futures=True)

@@ -5,29 +5,36 @@
 Study: the calibrations that answer the paper's two questions.
 
 Consistency: does a calibration find the same parameters with every random seed?
-Validity: do the parameters explain an action that was not calibrated on?  (Alvarez, Yamazaki
-and Matsubara, tables 1 and 2.)
+Validity: do the parameters explain an action that was left out of the calibration?  (Alvarez, Yamazaki and
+Matsubara, tables 1 and 2.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass, replace
+from concurrent.futures import CancelledError
+from contextlib import closing
+from dataclasses import dataclass, replace
 import functools
-import hashlib
-import json
-from pathlib import Path
-from typing import Any, Iterator, Mapping, Sequence
+import time
+from typing import Any, Callable, Iterator, Mapping
 
-import numpy as np
-
-from dlo_calibration.calibration.automatic import choose
-from dlo_calibration.calibration.declaration import MACHINE
-from dlo_calibration.calibration.options import names_of, Options
-from dlo_calibration.errors import InputError
+from dlo_calibration.calibration.calibrate import fitted
+from dlo_calibration.calibration.choice import choose
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import MACHINE, names_of, Options
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.errors import InputError, SimulationError
+from dlo_calibration.evaluation.digest import code_digest, digest
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.material import with_shared_places
+from dlo_calibration.search import SEARCHES
 
-#: Folders whose code cannot change what a calibration finds.
-SHOWING = ('cli', 'report', 'ros')
+#: Rooms whose code decides what a calibration or a plan finds.
+DECISIVE = ('model', 'observation', 'simulation', 'evaluation', 'search', 'inference', 'calibration',
+            'planning', 'experiment')
 
 
 @dataclass(frozen=True)
@@ -121,28 +128,58 @@ class Task:
     def key(self) -> str:
         """A digest of all that the outcome depends on: tasks with the same key have the same outcome."""
         judges = self.judges
-        return digest(self.engine, self.trials, effective(self.options), judges.trials,
-                      effective(judges.options))
+        return task_digest(self.engine, self.trials, effective(self.options), judges.trials,
+                           effective(judges.options))
 
 
-def tasks(subjects: Sequence[Subject], searches: Sequence[str], runs: int, seed: int,
-          engines: Mapping[str, str]) -> Iterator[Task]:
+@dataclass(frozen=True)
+class Study:
     """
-    Yield all calibrations of an experiment: the first run of every subject and search, then the second.
+    What an experiment does.
 
-    :param seed: of the first run; each further run adds one.
-    :param engines: name of the simulator, by the subject's name.
+    :param runs: calibrations of each subject with each search, each with its own seed.
+    :param seed: of the first run; each further run adds 1.
+    :param workers: threads; 0: one per core.
+    :param command: the command that repeats the experiment.
+    :param samples: whether the subjects are the samples of the package.
     """
-    for run in range(runs):
-        for subject in subjects:
-            for search in searches:
-                for left_out in (None, *subject.held_back):
-                    yield Task(subject, search, seed + run, engines[subject.name], left_out)
+
+    subjects: tuple[Subject, ...]
+    searches: tuple[str, ...]
+    runs: int
+    seed: int
+    workers: int
+    command: str
+    samples: bool
+
+    def __post_init__(self) -> None:
+        if self.runs < 1:
+            raise InputError('--runs', str(self.runs), '1 or more', 'correct it')
+        if not self.searches:
+            raise InputError('--search', 'no name', f'one or more of {", ".join(SEARCHES)}', 'name one')
+
+    @property
+    def evaluations(self) -> dict[str, int]:
+        """Largest number of evaluations of a calibration, by search."""
+        return {search: max(subject.observed.options_of(search, self.seed).evaluations
+                            for subject in self.subjects) for search in self.searches}
+
+    def tasks(self, engines: Mapping[str, str]) -> Iterator[Task]:
+        """
+        Yield all calibrations: the first run of every subject and search, then the second.
+
+        :param engines: name of the simulator, by the subject's name.
+        """
+        for run in range(self.runs):
+            for subject in self.subjects:
+                for search in self.searches:
+                    for left_out in (None, *subject.held_back):
+                        yield Task(subject, search, self.seed + run, engines[subject.name], left_out)
 
 
-def digest(*about: Any) -> str:
+def task_digest(*about: Any) -> str:
     """Return a digest of dataclasses, arrays and plain values, and of the source code of the package."""
-    return hashlib.sha256(json.dumps(_plain([_sources(), *about]), sort_keys=True).encode()).hexdigest()
+    return digest(code_digest(DECISIVE), *about)
 
 
 def effective(options: Options) -> dict[str, Any]:
@@ -151,23 +188,106 @@ def effective(options: Options) -> dict[str, Any]:
     return {name: value for name, value in options.flat().items() if name not in of_the_machine}
 
 
-def _plain(value: Any) -> Any:
-    """Convert a value to types that JSON has; numbers keep every digit."""
-    if is_dataclass(value):
-        return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    return value
+@dataclass(frozen=True)
+class Judgement:
+    """
+    How well the found parameters explain a trial that was left out of the calibration.
+
+    :param score: difference score [cm]; None if the trial could not be simulated.
+    :param error: mean point error [m]; None likewise.
+    :param share: mean point error [% of the DLO's length]; None likewise.
+    """
+
+    trial: str
+    score: float | None
+    error: float | None
+    share: float | None
 
 
-@functools.cache
-def _sources() -> str:
-    """Return a digest of the source code: other code may find other parameters."""
-    digest = hashlib.sha256()
-    folder = Path(__file__).parents[1]
-    for file in sorted(folder.rglob('*.py')):
-        if file.relative_to(folder).parts[0] not in SHOWING:
-            digest.update(f'{file.relative_to(folder)}\n'.encode() + file.read_bytes())
-    return digest.hexdigest()
+@dataclass(frozen=True)
+class Outcome:
+    """
+    The result of one calibration.
+
+    :param values: of the parameters, 0..100; empty if it failed.
+    :param excited: names of the parameters that the trials inform about; the others keep their default.
+    :param score: average difference score of the trials calibrated on [cm].
+    :param error: mean point error of the same trials [m].
+    :param evaluations: number of evaluations of the search.
+    :param simulations: number of rollouts in all.
+    :param seconds: its duration on one thread [s].
+    :param judgements: one for each trial that judges it.
+    :param failure: why it failed; empty if it did not.
+    """
+
+    values: Mapping[str, float]
+    excited: tuple[str, ...] = ()
+    score: float | None = None
+    error: float | None = None
+    evaluations: int = 0
+    simulations: int = 0
+    seconds: float = 0.0
+    judgements: tuple[Judgement, ...] = ()
+    failure: str = ''
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> Outcome:
+        """Build from the values of `asdict`; raise TypeError, KeyError or ValueError for any others."""
+        return cls(**{**entry, 'excited': tuple(entry['excited']), 'values': dict(entry['values']),
+                      'judgements': tuple(Judgement(**judgement) for judgement in entry['judgements'])})
+
+
+def perform(task: Task, make_simulator: SimulatorFactory,
+            should_stop: Callable[[], bool] = lambda: False) -> Outcome:
+    """
+    Calibrate once, on one thread, and judge the parameters found.
+
+    :raises CancelledError: if stopped.
+    """
+    options, trials, begun = task.options, task.trials, time.monotonic()
+    with closing(make_simulator(options)) as simulator:
+        try:
+            result = fitted(Setting(trials, options, simulator, should_stop=should_stop))
+        except SimulationError as error:
+            if should_stop():
+                raise CancelledError from error
+            return Outcome({}, failure=str(error))
+    if should_stop():
+        raise CancelledError
+    examined = result.examination
+    excited = result.space.free if examined is None else tuple(
+        name for name, there in zip(result.space.free, examined.uncertainty.excited, strict=True) if there)
+    return Outcome(
+        values=result.values, excited=excited, score=result.best.score, error=result.errors.mean,
+        evaluations=len(result.evaluations), simulations=result.simulations, seconds=time.monotonic() - begun,
+        judgements=_judgements(task.judges, result, make_simulator))
+
+
+def judged_chains(task: Task, outcome: Outcome, make_simulator: SimulatorFactory
+                  ) -> list[tuple[Trial, Floats]]:
+    """Return the trials that judge a task, each with its simulated chains at the goals, (g, n, 3) [m]."""
+    judges, chains = task.judges, []
+    space = replace(task.options.space, free=tuple(outcome.values))  # with the parts that the search found
+    with closing(make_simulator(judges.options)) as simulator:
+        for trial in with_shared_places(judges.trials):
+            physical = space.physical(outcome.values, trial.initial.length)
+            try:
+                chains.append((trial, simulator.simulate(trial, physical).chains))
+            except SimulationError:
+                continue
+    return chains
+
+
+def _judgements(judges: Observed, result: CalibrationResult,
+                make_simulator: SimulatorFactory) -> tuple[Judgement, ...]:
+    if not judges.trials:
+        return ()
+    judgements = []
+    point = result.space.point(result.values)
+    with closing(make_simulator(judges.options)) as simulator:
+        for trial in with_shared_places(judges.trials):
+            evaluation = Evaluator([trial], result.space, simulator).evaluate(0, point)
+            score, errors = evaluation.score, evaluation.errors
+            judgements.append(Judgement(trial.name, None, None, None) if errors is None else Judgement(
+                trial.name, score, errors.mean, 100 * errors.mean / trial.initial.length))
+    return tuple(judgements)

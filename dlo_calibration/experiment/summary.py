@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from statistics import fmean
 from typing import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.experiment.outcome import Outcome
-from dlo_calibration.experiment.study import Task
+from dlo_calibration.experiment.study import Outcome, Task
 from dlo_calibration.model.score import VERY_SIMILAR
 
 
@@ -40,11 +40,11 @@ class Spread:
 @dataclass(frozen=True)
 class Findings:
     """
-    What all runs of one search found about one object.
+    The results of all runs of one search on one object.
 
     :param parameters: consistency: the value of each parameter, 0..100, calibrated on all trials.
-    :param informed: number of runs in which the trials informed about each parameter; in the
-        others it kept its default.
+    :param informed: number of runs in which the trials informed about each parameter; in the others, it
+        kept its default.
     :param fitted: mean point error of the trials calibrated on [m].
     :param score: validity: a run's average difference score over the trials that judge it [cm].
     :param very_similar: number of runs whose score is below `VERY_SIMILAR`.
@@ -78,17 +78,16 @@ def complete_runs(done: Sequence[tuple[Task, Outcome]]) -> list[list[tuple[Task,
     by_seed: dict[int, list[tuple[Task, Outcome]]] = {}
     for task, outcome in done:
         by_seed.setdefault(task.seed, []).append((task, outcome))
-    return [found for _, found in sorted(by_seed.items())
-            if len(found) == 1 + len(found[0][0].subject.held_back)]
+    return [run for _, run in sorted(by_seed.items()) if len(run) == 1 + len(run[0][0].subject.held_back)]
 
 
-def run_score(found: Sequence[tuple[Task, Outcome]]) -> float | None:
+def run_score(run: Sequence[tuple[Task, Outcome]]) -> float | None:
     """Return a run's average difference score over the trials that judge it [cm]; None if there is none."""
-    return _mean([one.score for _, outcome in found for one in outcome.judgements])
+    return _mean([judgement.score for _, outcome in run for judgement in outcome.judgements])
 
 
 def _mean(numbers: Sequence[float | None]) -> float | None:
-    known = [one for one in numbers if one is not None]
+    known = [number for number in numbers if number is not None]
     return fmean(known) if known else None
 
 
@@ -96,14 +95,13 @@ def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:
     """Summarise the calibrations, at least one, of one subject with one search."""
     runs = complete_runs(done)
     subject, search = done[0][0].subject, done[0][0].search
-    whole = [outcome for found in runs for task, outcome in found
+    whole = [outcome for run in runs for task, outcome in run
              if task.left_out is None and not outcome.failure]
-    judged = [[one for _, outcome in found for one in outcome.judgements] for found in runs]
-    scores = [score for found in runs if (score := run_score(found)) is not None]
+    judged = [[judgement for _, outcome in run for judgement in outcome.judgements] for run in runs]
+    scores = [score for run in runs if (score := run_score(run)) is not None]
     by_action: dict[str, list[float]] = {}
-    for found in judged:
-        for one in found:
-            by_action.setdefault(one.trial, []).extend([] if one.score is None else [one.score])
+    for judgement in chain.from_iterable(judged):
+        by_action.setdefault(judgement.trial, []).extend([] if judgement.score is None else [judgement.score])
 
     def over_runs(values: Iterator[float | None]) -> Spread | None:
         return Spread.of([value for value in values if value is not None])
@@ -118,11 +116,11 @@ def summary(done: Sequence[tuple[Task, Outcome]]) -> Findings:
         informed={name: sum(name in outcome.excited for outcome in whole) for name in free},
         fitted=over_runs(outcome.error for outcome in whole),
         score=Spread.of(scores), very_similar=sum(score < VERY_SIMILAR for score in scores),
-        error=over_runs(_mean([one.error for one in found]) for found in judged),
-        share=over_runs(_mean([one.share for one in found]) for found in judged),
+        error=over_runs(_mean([judgement.error for judgement in run]) for run in judged),
+        share=over_runs(_mean([judgement.share for judgement in run]) for run in judged),
         actions={name: spread for name, values in by_action.items() if (spread := Spread.of(values))},
         worst=max((score for values in by_action.values() for score in values), default=None),
         evaluations=Spread.of([outcome.evaluations for outcome in whole]),
         seconds=Spread.of([outcome.seconds for outcome in whole]),
-        failures=sum(bool(outcome.failure) for found in runs for _, outcome in found)
-        + sum(one.score is None for found in judged for one in found))
+        failures=sum(bool(outcome.failure) for run in runs for _, outcome in run)
+        + sum(judgement.score is None for run in judged for judgement in run))

@@ -13,12 +13,10 @@ from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from dlo_calibration.calibration.plain import known
-from dlo_calibration.experiment.outcome import Outcome
-from dlo_calibration.experiment.study import Task
+from dlo_calibration.calibration.result import with_nulls
+from dlo_calibration.experiment.study import Outcome, Task
 from dlo_calibration.experiment.summary import complete_runs, Findings, Spread
-from dlo_calibration.model.parameters import knot_names, KNOTS
-from dlo_calibration.model.quantity import measured, number
+from dlo_calibration.model.parameters import knot_names, KNOTS, measured, number
 from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.figure import (
     as_text,
@@ -76,7 +74,7 @@ class Account:
     @property
     def searches(self) -> tuple[str, ...]:
         """Names of the searches."""
-        return tuple(dict.fromkeys(one.search for one in self.findings))
+        return tuple(dict.fromkeys(result.search for result in self.findings))
 
 
 def document(account: Account) -> dict[str, Any]:
@@ -84,7 +82,8 @@ def document(account: Account) -> dict[str, Any]:
     paper = {'consistency': PAPER_CONSISTENCY, 'validity': PAPER_VALIDITY} if account.samples else None
     return {'command': account.command, 'engine': account.engine, 'runs': account.runs,
             'evaluations': dict(account.evaluations), 'complete': account.complete,
-            'paper': known(paper), 'findings': known([asdict(one) for one in account.findings])}
+            'paper': with_nulls(paper),
+            'findings': with_nulls([asdict(result) for result in account.findings])}
 
 
 def markdown(account: Account) -> str:
@@ -100,40 +99,41 @@ def markdown(account: Account) -> str:
     parts += ['## Consistency', 'Average and standard deviation of each parameter over the runs, on the '
               'scale from 0 to 100, calibrated on all trials.  *Italic*: the trials do not inform about this '
               'parameter, so it keeps its default; if a number of runs is given, they do in these runs only.']
-    if any(name in knot_names(KNOTS[-1]) for one in account.findings for name in one.parameters):
+    if any(name in knot_names(KNOTS[-1]) for result in account.findings for name in result.parameters):
         parts.append('The components of rest shapes are in `consistency.csv`.')
     if account.samples:
         parts.append('The paper has figures of the objects that the samples resemble.  Its scales are those '
                      'of its own simulator: compare the standard deviations, but not the averages.')
     for search in account.searches:
-        parts += [f'### {search}', _consistency([one for one in account.findings if one.search == search],
-                                                 PAPER_CONSISTENCY if account.samples else {})]
+        results = [result for result in account.findings if result.search == search]
+        parts += [f'### {search}', _consistency(results, PAPER_CONSISTENCY if account.samples else {})]
     parts += ['## Validity', 'Average and standard deviation, over the runs, of the difference score of '
               'actions that were not calibrated on, and of their point error.  '
               f'A score below {SIMILAR:g} is similar, and below {VERY_SIMILAR:g} very similar (**bold**).  '
               'Seconds: one calibration on all trials, on one thread.', _validity(account)]
-    if any(one.actions for one in account.findings):
+    if any(result.actions for result in account.findings):
         parts += ['Difference score of each action by itself:', _actions(account)]
     return '\n\n'.join(parts) + '\n'
 
 
 def consistency_csv(account: Account) -> str:
     """Return a row for each object, search and parameter."""
-    return _csv(('object', 'search', 'parameter', 'runs', 'mean', 'std', 'runs_that_told_anything'), (
-        (one.subject, one.search, name, spread.count, spread.mean, spread.std, one.informed[name])
-        for one in account.findings for name, spread in one.parameters.items()))
+    return csv_text(('object', 'search', 'parameter', 'runs', 'mean', 'std', 'runs_that_told_anything'), (
+        (result.subject, result.search, name, spread.count, spread.mean, spread.std, result.informed[name])
+        for result in account.findings for name, spread in result.parameters.items()))
 
 
 def validity_csv(account: Account) -> str:
     """Return a row for each object and search, then one for each of their actions."""
     rows: list[tuple[Any, ...]] = []
-    for one in account.findings:
-        rows.append((one.subject, one.search, 'all', one.runs, _mean(one.score), _std(one.score),
-                     _mean(one.error), _std(one.error), _mean(one.share), _std(one.share), one.very_similar,
-                     _mean(one.evaluations), _mean(one.seconds), one.failures))
-        rows += [(one.subject, one.search, name, spread.count, spread.mean, spread.std)
-                 for name, spread in one.actions.items()]
-    return _csv(('object', 'search', 'action', 'runs', 'score_mean_cm', 'score_std_cm', 'error_mean_m',
+    for result in account.findings:
+        rows.append((result.subject, result.search, 'all', result.runs, _mean(result.score),
+                     _std(result.score), _mean(result.error), _std(result.error), _mean(result.share),
+                     _std(result.share), result.very_similar, _mean(result.evaluations),
+                     _mean(result.seconds), result.failures))
+        rows += [(result.subject, result.search, name, spread.count, spread.mean, spread.std)
+                 for name, spread in result.actions.items()]
+    return csv_text(('object', 'search', 'action', 'runs', 'score_mean_cm', 'score_std_cm', 'error_mean_m',
                  'error_std_m', 'error_mean_percent', 'error_std_percent', 'very_similar_runs', 'evaluations',
                  'seconds', 'failures'), rows)
 
@@ -142,15 +142,16 @@ def runs_csv(done: Sequence[tuple[Task, Outcome]]) -> str:
     """Return a row for each calibration."""
     names = list(dict.fromkeys(name for task, _ in done for name in task.options.space.free))
     rows = []
-    for task, one in done:
-        scores = [judged.score for judged in one.judgements]
+    for task, outcome in done:
+        scores = [judged.score for judged in outcome.judgements]
         rows.append((
             task.subject.name, task.search, task.seed, '' if task.left_out is None else task.left_out + 1,
-            *(one.values.get(name) for name in names), one.score, one.error,
+            *(outcome.values.get(name) for name in names), outcome.score, outcome.error,
             ' '.join('failed' if score is None else repr(score) for score in scores),
-            ' '.join('failed' if judged.error is None else repr(judged.error) for judged in one.judgements),
-            one.evaluations, one.simulations, one.seconds, one.failure))
-    return _csv(('object', 'search', 'seed', 'left_out_trial', *names, 'score_cm', 'error_m',
+            ' '.join('failed' if judged.error is None else repr(judged.error)
+                     for judged in outcome.judgements),
+            outcome.evaluations, outcome.simulations, outcome.seconds, outcome.failure))
+    return csv_text(('object', 'search', 'seed', 'left_out_trial', *names, 'score_cm', 'error_m',
                  'held_back_scores_cm', 'held_back_errors_m', 'evaluations', 'simulations', 'seconds',
                  'failure'), rows)
 
@@ -170,20 +171,20 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
     for group in done:
         task = group[0][0]
         which = searches.index(task.search)
-        whole = [outcome for run in complete_runs(group) for one, outcome in run
-                 if one.left_out is None and not outcome.failure]
+        whole = [outcome for run in complete_runs(group) for each, outcome in run
+                 if each.left_out is None and not outcome.failure]
         middle = subjects.index(task.subject.name) + (which - (len(searches) - 1) / 2) * 0.8 / len(searches)
         places = middle + np.linspace(-0.3, 0.3, len(whole)) / len(searches)
         for name, axes in zip(names, rows, strict=True):
             for place, outcome in zip(places, whole, strict=True):
                 if name in outcome.values:
-                    told = name in outcome.excited
-                    axes.plot(place, outcome.values[name], 'o' if told else 'x', markersize=4, alpha=0.8,
-                              color=COLOURS[which % len(COLOURS)] if told else '0.6')
+                    informed = name in outcome.excited
+                    axes.plot(place, outcome.values[name], 'o' if informed else 'x', markersize=4, alpha=0.8,
+                              color=COLOURS[which % len(COLOURS)] if informed else '0.6')
     for name, axes in zip(names, rows, strict=True):
         axes.set(ylabel=f'{name} [0..100]', ylim=(-3, 103))
         axes.grid(axis='y', alpha=0.3)
-    rows[-1].set_xticks(range(len(subjects)), [as_text(one) for one in subjects])
+    rows[-1].set_xticks(range(len(subjects)), [as_text(subject) for subject in subjects])
     rows[-1].set_xlim(-0.6, len(subjects) - 0.4)
     for which, search in enumerate(searches):
         rows[0].plot([], [], 'o', color=COLOURS[which % len(COLOURS)], label=search)
@@ -194,27 +195,27 @@ def scatter_picture(done: Sequence[Sequence[tuple[Task, Outcome]]], path: Path) 
 
 def _consistency(findings: Sequence[Findings],
                  paper: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
-    names = _in_tables(name for one in findings for name in one.parameters)
+    names = _in_tables(name for result in findings for name in result.parameters)
     rows: list[list[str]] = []
-    for one in findings:
-        average, deviation = [one.subject, 'average'], ['', 'standard deviation']
+    for result in findings:
+        average, deviation = [result.subject, 'average'], ['', 'standard deviation']
         for name in names:
-            spread = one.parameters.get(name)
-            told = one.informed.get(name, 0)
+            spread = result.parameters.get(name)
+            informed = result.informed.get(name, 0)
             mean, std = number(_mean(spread)), number(_std(spread))
-            if spread and not told:
+            if spread and not informed:
                 mean, std = f'*{mean}*', f'*{std}*'
-            elif spread and told < spread.count:
-                mean = f'{mean} *(in {told} of {spread.count} runs)*'
+            elif spread and informed < spread.count:
+                mean = f'{mean} *(in {informed} of {spread.count} runs)*'
             average.append(mean)
             deviation.append(std)
         rows += [average, deviation]
-        theirs = paper.get(one.subject)
+        theirs = paper.get(result.subject)
         if theirs:
             rows += [['', f'{word} in the paper', *(
                 f'{theirs[name][k]:g}' if name in theirs else '-' for name in names)]
                 for k, word in enumerate(('average', 'standard deviation'))]
-    return _table(('object', '', *names), rows)
+    return markdown_table(('object', '', *names), rows)
 
 
 def _in_tables(names: Iterable[str]) -> list[str]:
@@ -227,31 +228,33 @@ def _validity(account: Account) -> str:
             'mean error', 'standard deviation', '% of length', 'fitted trials', 'evaluations',
             'seconds']
     rows = []
-    for one in account.findings:
-        score, count = _mean(one.score), one.score.count if one.score else 0
+    for result in account.findings:
+        score, count = _mean(result.score), result.score.count if result.score else 0
         shown = number(score)
         rows.append([
-            one.subject, one.search, f'**{shown}**' if score is not None and score < VERY_SIMILAR else shown,
-            number(_std(one.score)), f'{one.very_similar} of {count} runs', number(one.worst),
-            measured(_mean(one.error), 'm'), measured(_std(one.error), 'm'), number(_mean(one.share)),
-            measured(_mean(one.fitted), 'm'), number(_mean(one.evaluations)), number(_mean(one.seconds))])
+            result.subject, result.search,
+            f'**{shown}**' if score is not None and score < VERY_SIMILAR else shown,
+            number(_std(result.score)), f'{result.very_similar} of {count} runs', number(result.worst),
+            measured(_mean(result.error), 'm'), measured(_std(result.error), 'm'),
+            number(_mean(result.share)), measured(_mean(result.fitted), 'm'),
+            number(_mean(result.evaluations)), number(_mean(result.seconds))])
     if account.samples:
         head.append('score in the paper')
         for row in rows:
             theirs = PAPER_VALIDITY.get(row[0])
             row.append(f'{theirs[0]:g} ± {theirs[1]:g}' if theirs else '-')
-    if any(one.failures for one in account.findings):
+    if any(result.failures for result in account.findings):
         head.append('failed')
-        for row, one in zip(rows, account.findings, strict=True):
-            row.append(str(one.failures))
-    return _table(head, rows)
+        for row, result in zip(rows, account.findings, strict=True):
+            row.append(str(result.failures))
+    return markdown_table(head, rows)
 
 
 def _actions(account: Account) -> str:
-    names = list(dict.fromkeys(name for one in account.findings for name in one.actions))
-    return _table(('object', 'search', *names), (
-        (one.subject, one.search, *(_both(one.actions.get(name)) for name in names))
-        for one in account.findings))
+    names = list(dict.fromkeys(name for result in account.findings for name in result.actions))
+    return markdown_table(('object', 'search', *names), (
+        (result.subject, result.search, *(_both(result.actions.get(name)) for name in names))
+        for result in account.findings))
 
 
 def _both(spread: Spread | None) -> str:
@@ -266,12 +269,14 @@ def _std(spread: Spread | None) -> float | None:
     return None if spread is None else spread.std
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     lines = (head, ['---'] * len(head), *rows)
     return '\n'.join(f'| {" | ".join(cell.replace("|", chr(92) + "|") for cell in row)} |' for row in lines)
 
 
-def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table as comma-separated values; short rows end with empty cells."""
     stream = StringIO()
     writer = csv.writer(stream, lineterminator='\n')
     writer.writerow(head)

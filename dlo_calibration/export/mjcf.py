@@ -12,7 +12,7 @@ The integrator that both versions have, `implicitfast`, takes the springs of joi
 stiffness k needs a step below ``2 sqrt(m / k)``, which is far below a millisecond for a segment of a gram.
 So each joint has an armature of ``k h^2``: with it, every spring is stable at the step h, also in the contact
 solver, which knows no implicit damping.  An armature resists only bending and stretching, and slows a mode of
-frequency w by the share ``(w h)^2 / 2``.  The damping is the found one, but at least 0.6 h k, as in
+frequency w by the share ``(w h)^2 / 2``.  The damping is the calibrated one, but at least 0.6 h k, as in
 `simulation.rod`.
 """
 
@@ -21,13 +21,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError, one_of
-from dlo_calibration.export.rope import ExportedRope, quaternion
+from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.quantity import interval, measured
+from dlo_calibration.model.parameters import interval, measured
 from dlo_calibration.planning.dlo import CalibratedDlo
 
 NAME = 'dlo'  # begins the names of bodies, joints, geoms and sites
@@ -43,26 +44,26 @@ HARDNESS = 10
 LEAST_DAMPING = 0.6  # time steps, of the damping relative to the stiffness
 
 
-def export_mjcf(found: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
+def export_mjcf(dlo: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
                 options: Options | None = None) -> str:
     """
     Return a calibrated DLO at an observed chain as the text of an MJCF file.
 
-    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
-    :param form: extensible: with the found EA; inextensible: faster, for a DLO that nothing stretches.
+    :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param form: extensible: with the calibrated EA; inextensible: faster, for a DLO that nothing stretches.
     :param options: see `ExportedRope.of`.
     :raises InputError: if the form is unknown, or there are too many points or nodes.
     """
-    rope = ExportedRope.of(found, chain, options)
+    rope = ExportedRope.of(dlo, chain, options)
     if form not in FORMS:
         raise InputError('form', repr(form), one_of(FORMS, form), 'correct it')
     if len(rope.points) > MOST_NODES:
         raise InputError('nodes', str(len(rope.points)), f'at most {MOST_NODES}, as MuJoCo reads no deeper '
                          'nested bodies', 'take fewer nodes')
-    return document(_Writer(rope, form == 'extensible').root()).decode()
+    return document(_MjcfWriter(rope, form == 'extensible').root()).decode()
 
 
-class _Writer:
+class _MjcfWriter:
     """
     Makes the elements of a file.
 
@@ -75,9 +76,7 @@ class _Writer:
 
     def root(self) -> Any:
         """Return the root element."""
-        rope, holder = self._rope, new_root('holder')
-        root = add(holder, 'mujoco', model=NAME)
-        holder.remove(root)
+        rope, root = self._rope, new_root('mujoco', model=NAME)
         add_comment(root, self._about())
         add(root, 'option', timestep=TIME_STEP, integrator='implicitfast', cone='elliptic', impratio=HARDNESS,
             viscosity=_text(self._viscosity()))
@@ -91,34 +90,33 @@ class _Writer:
         if rope.table is not None:
             add(world, 'geom', name='table', type='plane', size='0 0 0.1', pos=_text([0, 0, rope.table]),
                 friction=_text([1, 0, 0]), rgba='0.5 0.5 0.5 1')
-        turns = _rest_turns(rope)
         parent = world
         for k in range(len(rope.rest_lengths)):
-            parent = self._segment(parent, k, turns)
+            parent = self._segment(parent, k)
         contact = add(root, 'contact')
         for k in range(len(rope.rest_lengths)):
             for other in range(k + 1, min(k + 1 + self._touching(), len(rope.rest_lengths))):
                 add(contact, 'exclude', body1=f'{NAME}_{k}', body2=f'{NAME}_{other}')
-        add(add(root, 'keyframe'), 'key', name='start', qpos=_text(self._start(turns)))
+        add(add(root, 'keyframe'), 'key', name='start', qpos=_text(self._start()))
         return root
 
-    def _segment(self, parent: Any, k: int, turns: Floats) -> Any:
+    def _segment(self, parent: Any, k: int) -> Any:
         """Add the body of a segment to that of the one before, or the first to the world; return it."""
         rope, length, mass = self._rope, float(self._rope.rest_lengths[k]), float(self._rope.masses[k])
         across = mass * (length**2 / 12 + rope.radius**2 / 4)
         if k == 0:
             body = add(parent, 'body', name=f'{NAME}_0', pos=_text(rope.points[0]),
-                       quat=_text(quaternion(rope.frames[0])), childclass=NAME)
+                       quat=_text(_quaternions(Rotation.from_matrix(rope.frames[0]))), childclass=NAME)
             add(body, 'freejoint', name=f'{NAME}_root')
         else:
+            turn = rope.rest_turns[k - 1]
             body = add(parent, 'body', name=f'{NAME}_{k}', pos=_text([rope.rest_lengths[k - 1], 0, 0]),
-                       quat=_text(turns[k - 1]))
+                       quat=_text(_quaternions(turn)))
             if self._stretches:
                 stiffness = rope.stretching_stiffness / self._stretched()[k - 1]
-                along = _turned(turns[k - 1] * [1, -1, -1, -1], np.array([1.0, 0.0, 0.0]))
-                add(body, 'joint', name=f'{NAME}_stretch_{k}', type='slide', axis=_text(along),
-                    stiffness=_text(stiffness), damping=_text(stiffness * self._least),
-                    armature=_text(stiffness * TIME_STEP**2))
+                add(body, 'joint', name=f'{NAME}_stretch_{k}', type='slide',
+                    axis=_text(turn.inv().apply([1, 0, 0])), stiffness=_text(stiffness),
+                    damping=_text(stiffness * self._least), armature=_text(stiffness * TIME_STEP**2))
             stiffness = rope.bending_stiffness[k - 1] / rope.cells[k - 1]
             add(body, 'joint', name=f'{NAME}_bend_{k}', type='ball', stiffness=_text(stiffness),
                 damping=_text(stiffness * self._least), armature=_text(max(stiffness * TIME_STEP**2, across)))
@@ -143,16 +141,12 @@ class _Writer:
                 add(marker, 'inertial', pos='0 0 0', mass=_text(mass),
                     diaginertia=_text(3 * [0.4 * mass * rope.radius**2]))
 
-    def _start(self, turns: Floats) -> Floats:
+    def _start(self) -> Floats:
         """Return the positions of all joints at the observed chain."""
-        rope = self._rope
-        found = [rope.points[0], quaternion(rope.frames[0])]
-        for k, rest in enumerate(turns):
-            if self._stretches:
-                found.append(np.zeros(1))
-            found.append(_product(rest * [1, -1, -1, -1],
-                                  quaternion(rope.frames[k].T @ rope.frames[k + 1])))
-        return np.concatenate(found)
+        frames = Rotation.from_matrix(self._rope.frames)
+        bends = _quaternions(self._rope.rest_turns.inv() * frames[:-1].inv() * frames[1:])
+        joints = np.column_stack([np.zeros(len(bends)), bends]) if self._stretches else bends
+        return np.concatenate([self._rope.points[0], _quaternions(frames[0]), joints.ravel()])
 
     def _stretched(self) -> Floats:
         """Return the length [m] whose stretch each inner node has, (n - 2,); the ends' halves are added."""
@@ -167,7 +161,7 @@ class _Writer:
 
     def _viscosity(self) -> float:
         """
-        Return the viscosity of the air [Pa s] in which a segment is slowed by the found drag.
+        Return the viscosity of the air [Pa s] in which a segment is slowed by the calibrated drag.
 
         MuJoCo's inertia box of a rod is l by sqrt(3) r by sqrt(3) r, and its drag is 3 pi times the viscosity
         and the mean of these (MuJoCo documentation, Computation, Fluid forces, Inertia model).
@@ -177,13 +171,13 @@ class _Writer:
         return float(rope.drag * rope.masses[0] / (3 * np.pi * size))
 
     def _about(self) -> list[str]:
-        """Return what a reader of the file must know."""
+        """Return the lines of the comment at the top of the file."""
         rope = self._rope
         ends = float(rope.bending_stiffness.min()), float(rope.bending_stiffness.max())
         bending = measured(ends[0], 'N m^2') if np.isclose(*ends) else interval(*ends, 'N m^2')
         lines = [
             'A calibrated DLO, written by dlo_calibration; SI units. Found parameters:', *rope.values,
-            *rope.remarks, 'Kept:',
+            *rope.warnings, 'Kept:',
             f'EI of {bending} in the ball joints, the rest shape (the bodies stand in it), mass of '
             f'{1e3 * rope.masses.sum():.3g} g, friction (also against rolling: the DLO slides), drag as '
             'viscosity of the air; the keyframe "start" has the chain',
@@ -195,11 +189,11 @@ class _Writer:
         return lines
 
     def _lost(self) -> list[str]:
-        """Return what MuJoCo cannot keep."""
+        """Return a line for each property of the DLO that MuJoCo cannot represent."""
         rope = self._rope
-        found = 'the trials were simulated without resistance to twist' if rope.twisting_stiffness is None \
+        twist = 'the trials were simulated without resistance to twist' if rope.twisting_stiffness is None \
             else f'GJ {measured(float(rope.twisting_stiffness[0]), "N m^2")} was found'
-        lines = [f'twist: ball joints resist twist as bending; {found}',
+        lines = [f'twist: ball joints resist twist as bending; {twist}',
                  f'contact between {self._touching() + 1} neighbouring segments',
                  f'damping relative to the stiffness of {1e3 * rope.internal_damping:.3g} ms; it is '
                  f'{1e3 * self._least:.3g} ms here']
@@ -211,26 +205,9 @@ class _Writer:
         return lines
 
 
-def _rest_turns(rope: ExportedRope) -> Floats:
-    """Return the rotation from each segment to the next in the rest shape, (n - 2, 4) quaternions w x y z."""
-    bends = rope.natural_curvature * rope.cells[:, None]
-    sizes = np.linalg.norm(bends, axis=1)
-    # The tangent turns towards the curvature: about its cross product with it.
-    axes = np.column_stack([np.zeros(len(bends)), -bends[:, 1], bends[:, 0]])
-    share = np.sinc(sizes / 2 / np.pi) / 2
-    return np.column_stack([np.cos(sizes / 2), axes * share[:, None]])
-
-
-def _product(one: Floats, other: Floats) -> Floats:
-    """Return the product of two quaternions w x y z."""
-    vector = one[0] * other[1:] + other[0] * one[1:] + np.cross(one[1:], other[1:])
-    return np.array([one[0] * other[0] - one[1:] @ other[1:], *vector])
-
-
-def _turned(quaternion: Floats, vector: Floats) -> Floats:
-    """Return a vector, (3,), rotated by a quaternion w x y z."""
-    twice = 2 * np.cross(quaternion[1:], vector)
-    return np.asarray(vector + quaternion[0] * twice + np.cross(quaternion[1:], twice))
+def _quaternions(rotations: Rotation) -> Floats:
+    """Return (..., 4) quaternions w x y z, with w >= 0."""
+    return np.roll(rotations.as_quat(canonical=True), 1, axis=-1)
 
 
 def _text(values: Any) -> str:

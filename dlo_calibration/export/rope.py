@@ -6,22 +6,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE
-from dlo_calibration.model.bending import natural_curvature
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.parameters import BY_NAME, ParameterSpace, PART_NAMES
-from dlo_calibration.model.quantity import measured
+from dlo_calibration.model.parameters import BY_NAME, measured, natural_curvature, ParameterSpace, PART_NAMES
 from dlo_calibration.observation.noise import NO_NOISE, noise_of, smooth
 from dlo_calibration.observation.table import lying_level, rest_on
 from dlo_calibration.planning.dlo import CalibratedDlo
 from dlo_calibration.simulation.nodes import feature_shares, spread_places
 
-LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a remark
+LEVEL_TOLERANCE = 1e-3  # m; a table that is moved by less is not worth a warning
 LENGTH_TOLERANCE = 0.05  # of the length; a chain that differs by more may belong to another DLO
 
 
@@ -51,7 +51,7 @@ class ExportedRope:
     :param table: height of the table [m]; None: there is none.
     :param point_places: (m,) arc lengths of the points of the chain at rest [m], from 0.
     :param values: a line for each found parameter: value, 90 % interval, verdict.
-    :param remarks: sentences: which parameters the trials do not determine, and what was assumed.
+    :param warnings: which parameters the trials do not determine, and what was assumed.
     """
 
     points: Floats
@@ -73,7 +73,7 @@ class ExportedRope:
     table: float | None
     point_places: Floats
     values: tuple[str, ...]
-    remarks: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def cells(self) -> Floats:
@@ -91,18 +91,19 @@ class ExportedRope:
         return bool(self.rest_lengths.min() > 2 * self.radius)
 
     @property
+    def rest_turns(self) -> Rotation:
+        """The n - 2 rotations from each segment to the next in the rest shape: towards the curvature."""
+        bends = self.natural_curvature * self.cells[:, None]
+        return Rotation.from_rotvec(np.column_stack([np.zeros(len(bends)), -bends[:, 1], bends[:, 0]]))
+
+    @property
     def rest_frames(self) -> Floats:
         """
         Material frames of the segments in the rest shape, (n - 1, 3, 3), the first as at the start.
 
-        They turn from segment to segment by the smallest rotation, as in `model.bending.rest_shape`.
+        They turn from segment to segment by the smallest rotation, as in `model.parameters.rest_shape`.
         """
-        frames = [self.frames[0]]
-        for bend in self.natural_curvature * self.cells[:, None]:
-            size = float(np.linalg.norm(bend))
-            along = np.array([np.cos(size), *(np.sinc(size / np.pi) * bend)])
-            frames.append(frames[-1] @ smallest_rotation(np.array([1.0, 0.0, 0.0]), along))
-        return np.array(frames)
+        return np.array([*accumulate(self.rest_turns.as_matrix(), np.matmul, initial=self.frames[0])])
 
     def place_of(self, place: float) -> tuple[int, float]:
         """Return the segment at an arc length [m], and how far from its first node it is [m]."""
@@ -111,16 +112,16 @@ class ExportedRope:
         return segment, float(min(max(place - ends[segment], 0.0), self.rest_lengths[segment]))
 
     @classmethod
-    def of(cls, found: CalibratedDlo, chain: Chain, options: Options | None = None) -> ExportedRope:
+    def of(cls, dlo: CalibratedDlo, chain: Chain, options: Options | None = None) -> ExportedRope:
         """
         Return a calibrated DLO at an observed chain.
 
-        :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+        :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
         :param options: `nodes`, `table` and `table_height` are used; None: the defaults.
         """
         options = options or Options()
-        physical = found.space.physical({name: one.value for name, one in found.parameters.items()},
-                                        found.length)
+        physical = dlo.space.physical({name: estimate.value for name, estimate in dlo.parameters.items()},
+                                        dlo.length)
         radius, twisting = physical['self_collision'], physical.get('torsion', 0.0)
         level = lying_level(chain, options.table_height) if options.table else None
         chain = _without_noise(chain)
@@ -147,8 +148,8 @@ class ExportedRope:
             bending_slip=physical.get('bending_slip', 0.0),
             table=None if not options.table else options.table_height if level is None else level - radius,
             point_places=frozen_array(chain.arc_lengths() * lengths.sum() / places[-1]),
-            values=_values(found),
-            remarks=(*_undetermined(found), *_assumed(found, physical, chain),
+            values=_values(dlo),
+            warnings=(*_undetermined(dlo), *_assumed(dlo, physical, chain),
                      *_about_table(level, radius, options)))
 
 
@@ -191,68 +192,55 @@ def _material_frames(points: Floats, moments: Floats) -> Floats:
     across = np.cross(tangents[0], start)
     frames = [np.column_stack([tangents[0], across, np.cross(tangents[0], across)])
               / [1.0, *2 * [np.linalg.norm(across)]]]
-    for one, other in zip(tangents[:-1], tangents[1:], strict=True):
-        frames.append(smallest_rotation(one, other) @ frames[-1])
-    found = np.array(frames)
-    bends = np.einsum('jik,ji->jk', found[:-1] + found[1:], np.diff(tangents, axis=0))[:, 1:]
+    for tangent, following in zip(tangents[:-1], tangents[1:], strict=True):
+        frames.append(_smallest_rotation(tangent, following) @ frames[-1])
+    carried = np.array(frames)
+    bends = np.einsum('jik,ji->jk', carried[:-1] + carried[1:], np.diff(tangents, axis=0))[:, 1:]
     angle = np.arctan2((moments[:, 0] * bends[:, 1] - moments[:, 1] * bends[:, 0]).sum(),
                        (moments * bends).sum())
     turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    return np.asarray(found @ turn)
+    return np.asarray(carried @ turn)
 
 
-def smallest_rotation(one: Floats, other: Floats) -> Floats:
+def _smallest_rotation(start: Floats, end: Floats) -> Floats:
     """Return the (3, 3) rotation by the smallest angle that turns one unit vector, (3,), into another."""
-    axis, cosine = np.cross(one, other), float(one @ other)
+    axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1 + 1e-9:  # the DLO turns back on itself: any axis across it does
-        across = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])
         across /= np.linalg.norm(across)
         return np.asarray(2 * np.outer(across, across) - np.eye(3))
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))
 
 
-def quaternion(rotation: Floats) -> Floats:
-    """Return the quaternion w x y z, (4,), of a (3, 3) rotation matrix, with w >= 0."""
-    m = rotation
-    found = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-                      [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-                      [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-                      [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]]])
-    # The eigenvector of the largest eigenvalue (Bar-Itzhack, New Method for Extracting the Quaternion from a
-    # Rotation Matrix, 2000).
-    _, vectors = np.linalg.eigh(found + np.triu(found, 1).T)
-    best = vectors[:, -1]
-    return np.asarray(best if best[0] >= 0 else -best)
-
-
-def _values(found: CalibratedDlo) -> tuple[str, ...]:
+def _values(dlo: CalibratedDlo) -> tuple[str, ...]:
     return tuple(
-        f'{name}, {BY_NAME[name].quantity}: {_said(found.space, name, one.value)} '
-        f'({_interval(found.space, name, one.lower, one.upper)}), {one.verdict or "verdict unknown"}'
-        for name, one in found.parameters.items())
+        f'{name}, {BY_NAME[name].quantity}: {_said(dlo.space, name, estimate.value)} '
+        f'({_interval(dlo.space, name, estimate.lower, estimate.upper)}), '
+        f'{estimate.verdict or "verdict unknown"}'
+        for name, estimate in dlo.parameters.items())
 
 
-def _undetermined(found: CalibratedDlo) -> list[str]:
-    """Return a sentence for each parameter that the trials do not determine, with its interval."""
+def _undetermined(dlo: CalibratedDlo) -> list[str]:
+    """Return a warning for each parameter that the trials do not determine, with its interval."""
     return [f'{name} is not identifiable: the trials allow '
-            f'{_interval(found.space, name, one.lower, one.upper)}; '
-            f'{_said(found.space, name, one.value)} is used'
-            for name, one in found.parameters.items() if one.verdict == NOT_IDENTIFIABLE
-            or not one.verdict and not one.identifiable]
+            f'{_interval(dlo.space, name, estimate.lower, estimate.upper)}; '
+            f'{_said(dlo.space, name, estimate.value)} is used'
+            for name, estimate in dlo.parameters.items() if estimate.verdict == NOT_IDENTIFIABLE
+            or not estimate.verdict and not estimate.identifiable]
 
 
-def _assumed(found: CalibratedDlo, physical: Mapping[str, float], chain: Chain) -> list[str]:
-    remarks = []
-    if not found.space.mass_known:
-        remarks.append(f'the mass of the DLO is unknown: {1e3 * physical["mass"]:.3g} g are assumed, and EI '
+def _assumed(dlo: CalibratedDlo, physical: Mapping[str, float], chain: Chain) -> list[str]:
+    warnings = []
+    if not dlo.space.mass_known:
+        warnings.append(f'the mass of the DLO is unknown: {1e3 * physical["mass"]:.3g} g are assumed, and EI '
                        'and EA hold for this mass; all three may be multiplied by the same number')
-    change = abs(chain.length - found.length) / found.length
+    change = abs(chain.length - dlo.length) / dlo.length
     if change > LENGTH_TOLERANCE:
-        remarks.append(f'the chain is {chain.length:.4g} m long, {100 * change:.0f} % from the '
-                       f'{found.length:.4g} m of the calibrated DLO: check that both are the same DLO, in '
+        warnings.append(f'the chain is {chain.length:.4g} m long, {100 * change:.0f} % from the '
+                       f'{dlo.length:.4g} m of the calibrated DLO: check that both are the same DLO, in '
                        'metres')
-    return remarks
+    return warnings
 
 
 def _about_table(level: float | None, radius: float, options: Options) -> list[str]:
@@ -269,5 +257,5 @@ def _said(space: ParameterSpace, name: str, value: float) -> str:
 
 def _interval(space: ParameterSpace, name: str, lower: float, upper: float) -> str:
     """Return a 90 % interval for people."""
-    (one, unit), (other, _) = (space.reported(name, value) for value in (lower, upper))
-    return f'90 %: {BY_NAME[name].interval(lower, upper, (min(one, other), max(one, other)), unit)}'
+    (first, unit), (second, _) = (space.reported(name, value) for value in (lower, upper))
+    return f'90 %: {BY_NAME[name].interval(lower, upper, (min(first, second), max(first, second)), unit)}'

@@ -18,28 +18,28 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.export.rope import ExportedRope, quaternion
+from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import add, add_comment, document, new_root
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.quantity import measured
+from dlo_calibration.model.parameters import measured
 from dlo_calibration.planning.dlo import CalibratedDlo
 
 NAME = 'dlo'  # begins the names of links, joints and frames
 VERSION = '1.9'  # Gazebo Fortress and later
 
 
-def export_sdf(found: CalibratedDlo, chain: Chain, *, options: Options | None = None) -> str:
+def export_sdf(dlo: CalibratedDlo, chain: Chain, *, options: Options | None = None) -> str:
     """
     Return a calibrated DLO at an observed chain as the text of an SDF model.
 
-    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param options: see `ExportedRope.of`.
     """
-    rope = ExportedRope.of(found, chain, options)
-    root = new_root('sdf')
-    root.set('version', VERSION)
+    rope = ExportedRope.of(dlo, chain, options)
+    root = new_root('sdf', version=VERSION)
     model = add(root, 'model', name=NAME)
     add_comment(model, _about(rope))
     _add(model, 'self_collide', 'true' if rope.slender else 'false')
@@ -60,8 +60,8 @@ def export_sdf(found: CalibratedDlo, chain: Chain, *, options: Options | None = 
 def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> None:
     """Add a link whose frame lies at the start of the segment, (3,) [m], x along it."""
     link, length = add(model, 'link', name=f'{NAME}_{segment}'), float(rope.rest_lengths[segment])
-    w, *vector = quaternion(rope.frames[segment])
-    pose = _add(link, 'pose', [*start, *vector, w])
+    turn = Rotation.from_matrix(rope.frames[segment]).as_quat(canonical=True)
+    pose = _add(link, 'pose', [*start, *turn])
     pose.set('rotation_format', 'quat_xyzw')
     _add_inertia(link, rope, segment)
     collision = add(link, 'collision', name='collision')
@@ -69,9 +69,9 @@ def _add_link(model: Any, rope: ExportedRope, segment: int, start: Floats) -> No
     _add(add(add(collision, 'geometry'), 'box'), 'size', [length, 2 * rope.radius, 2 * rope.radius])
     friction = add(add(collision, 'surface'), 'friction')
     for engine, names in (('ode', ('mu', 'mu2')), ('bullet', ('friction', 'friction2'))):
-        one = add(friction, engine)
+        surface = add(friction, engine)
         for name in names:
-            _add(one, name, rope.friction)
+            _add(surface, name, rope.friction)
     visual = add(link, 'visual', name='visual')
     _add(visual, 'pose', [length / 2, 0, 0, 0, np.pi / 2, 0])
     capsule = add(add(visual, 'geometry'), 'capsule')
@@ -100,16 +100,16 @@ def _add_inertia(link: Any, rope: ExportedRope, segment: int) -> None:
 
 def _add_joint(model: Any, rope: ExportedRope, joint: int, rest: Floats) -> None:
     """Add the joint at the first node of a segment; `rest` are the frames in the rest shape."""
-    one = add(model, 'joint', name=f'{NAME}_bend_{joint}', type='universal')
-    _add(one, 'parent', f'{NAME}_{joint - 1}')
-    _add(one, 'child', f'{NAME}_{joint}')
+    element = add(model, 'joint', name=f'{NAME}_bend_{joint}', type='universal')
+    _add(element, 'parent', f'{NAME}_{joint - 1}')
+    _add(element, 'child', f'{NAME}_{joint}')
     stiffness = rope.bending_stiffness[joint - 1] / rope.cells[joint - 1]
     both = slice(joint - 1, joint + 1)
     axes, reference = _axes(rope.frames[both], rest[both])
     for tag, axis, angle in (('axis', axes[0], reference), ('axis2', axes[1], 0.0)):
-        element = add(one, tag)
-        _add(element, 'xyz', axis)
-        dynamics = add(element, 'dynamics')
+        axis_element = add(element, tag)
+        _add(axis_element, 'xyz', axis)
+        dynamics = add(axis_element, 'dynamics')
         _add(dynamics, 'spring_reference', angle)
         _add(dynamics, 'spring_stiffness', stiffness)
         _add(dynamics, 'damping', stiffness * rope.internal_damping)
@@ -123,14 +123,12 @@ def _axes(start: Floats, rest: Floats) -> tuple[Floats, float]:
     :param rest: (2, 3, 3) in the rest shape.
     """
     # The frame of the second link at rest, seen from where it is at the start.
-    turn = start[1].T @ start[0] @ rest[0].T @ rest[1]
-    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    sine = float(np.linalg.norm(axis)) / 2
-    if sine < 1e-9:
+    turn = Rotation.from_matrix(start[1].T @ start[0] @ rest[0].T @ rest[1]).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-9:
         return np.eye(3)[1:], 0.0
-    first = axis / (2 * sine)
+    first = turn / angle
     second = np.cross([1.0, 0.0, 0.0], first)
-    angle = float(np.arctan2(sine, (np.trace(turn) - 1) / 2))
     return np.array([first, second / np.linalg.norm(second)]), angle
 
 
@@ -142,10 +140,10 @@ def _starts(rope: ExportedRope) -> Floats:
 
 
 def _about(rope: ExportedRope) -> list[str]:
-    """Return what a reader of the file must know."""
+    """Return the lines of the comment at the top of the file."""
     lines = [
         'A calibrated DLO, by dlo_calibration, for Gazebo with the physics engine DART. SI units.',
-        *rope.values, *rope.remarks,
+        *rope.values, *rope.warnings,
         'Kept: EI / l and its damping as springs of the joints, mass, friction, radius, and the rest shape '
         'as spring_reference. The frames dlo_point_i are the points of the chain.',
         f'Not kept: EA = {measured(rope.stretching_stiffness, "N")}, the links are rigid; twist, which '
@@ -163,5 +161,5 @@ def _add(parent: Any, tag: str, value: Any) -> Any:
     """Add an element with text: a word, or numbers."""
     element = add(parent, tag)
     element.text = value if isinstance(value, str) else ' '.join(
-        repr(one) for one in np.atleast_1d(np.asarray(value, dtype=float)).tolist())
+        repr(number) for number in np.atleast_1d(np.asarray(value, dtype=float)).tolist())
     return element

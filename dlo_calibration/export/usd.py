@@ -21,19 +21,19 @@ from dlo_calibration.errors import InputError, one_of
 from dlo_calibration.export.rope import ExportedRope
 from dlo_calibration.files.xml import text_of
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.quantity import measured
+from dlo_calibration.model.parameters import measured
 from dlo_calibration.planning.dlo import CalibratedDlo
 
 NAME = 'dlo'
 FORMS = ('newton-1.6', 'newton-1.4')
 
 
-def export_usd(found: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
+def export_usd(dlo: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
                options: Options | None = None) -> str:
     """
     Return a calibrated DLO at an observed chain as the text of a USD layer.
 
-    :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
+    :param dlo: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param form: newton-1.6: stiffnesses EA, EI and GJ, for Newton 1.6 and later and Isaac Lab 3.0;
         newton-1.4: the moduli of a round cross-section that has them, for Newton 1.4 and 1.5.
     :param options: see `ExportedRope.of`.
@@ -41,7 +41,7 @@ def export_usd(found: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
     """
     if form not in FORMS:
         raise InputError('form', repr(form), one_of(FORMS, form), 'correct it')
-    rope = ExportedRope.of(found, chain, options)
+    rope = ExportedRope.of(dlo, chain, options)
     moduli = form == FORMS[1]
     curve = [*_shape(rope), *([] if moduli else _thickness(rope)), *_rest(rope, moduli), *_masses(rope),
              f'rel material:binding:physics = </{NAME}/material>']
@@ -62,7 +62,7 @@ def export_usd(found: CalibratedDlo, chain: Chain, *, form: str = FORMS[0],
 
 
 def _shape(rope: ExportedRope) -> list[str]:
-    """Return what shows the curve; a curve with normals would be a ribbon."""
+    """Return the geometry of the curve, without normals, which would make it a ribbon."""
     return ['uniform token type = "linear"', f'int[] curveVertexCounts = [{len(rope.points)}]',
             f'point3f[] points = {_vectors(rope.points)}',
             f'float[] widths = [{_number(2 * rope.radius)}] (', '    interpolation = "constant"', ')',
@@ -87,7 +87,7 @@ def _rest(rope: ExportedRope, moduli: bool) -> list[str]:
 
 
 def _masses(rope: ExportedRope) -> list[str]:
-    """Return the masses at the points, if there are markers; else the density says it all."""
+    """Return the masses at the points if there are markers; else the density suffices."""
     if not rope.marker_masses.any():
         return []
     points = np.array(rope.marker_masses)
@@ -139,12 +139,12 @@ def _mean(rope: ExportedRope, stiffnesses: Floats) -> float:
 
 
 def _about(rope: ExportedRope, moduli: bool) -> list[str]:
-    """Return what a reader of the file must know."""
+    """Return the lines of the documentation of the file."""
     stretch, _, bend, twist = _values(rope)
     version = 'Newton 1.4 and 1.5: its stiffnesses are moduli [Pa] of a round cross-section' if moduli else \
         'Newton 1.6 and later, and Isaac Lab 3.0: its stiffnesses are EA [N], EI and GJ [N m^2]'
     twisting = '' if moduli else f'GJ = {measured(twist, "N m^2")}, '
-    lines = [f'A calibrated DLO, by dlo_calibration, for {version}. SI units.', *rope.values, *rope.remarks,
+    lines = [f'A calibrated DLO, by dlo_calibration, for {version}. SI units.', *rope.values, *rope.warnings,
              f'Kept: EA = {measured(stretch, "N")}, EI = {measured(bend, "N m^2")}, {twisting}mass, '
              'friction, radius. Newton takes the geometric mean of the friction of two bodies: give the '
              'table that of the DLO, too.']
@@ -172,7 +172,7 @@ def _about(rope: ExportedRope, moduli: bool) -> list[str]:
 
 def _prim(kind: str, name: str, schemas: list[str], content: list[str]) -> list[str]:
     """Return the lines of a prim with applied schemas."""
-    names = ', '.join(f'"{one}"' for one in schemas)
+    names = ', '.join(f'"{schema}"' for schema in schemas)
     return [f'def {kind} "{name}" (',
             f'    prepend apiSchemas = [{names}]', ')', '{',
             *(f'    {line}' if line else '' for line in content), '}']

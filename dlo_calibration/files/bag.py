@@ -1,80 +1,144 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bag: reads the messages of an MCAP file, a rosbag2 folder or a .db3 file, even if it is damaged."""
+"""
+Bag: the content of a recording, within limits.
+
+Files come from strangers: a few bytes may unpack to any number of messages.  Only messages that this package
+uses are kept; all others are counted and dropped as they are read.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
 import json
-from pathlib import Path, PurePath
-import tempfile
-from typing import Any, Iterable, Mapping
+from pathlib import Path
+import re
+from typing import Any, Callable, Iterable, Mapping
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.input_messages import DEFINITIONS, input_types
-from dlo_calibration.files.intake import Intake, LimitExceeded, Record, require_file
-from dlo_calibration.files.mcap_file import McapFile
-from dlo_calibration.files.recording import METADATA_FILE, METADATA_KEY, typestore
-from dlo_calibration.files.sqlite_file import read_sqlite
-from dlo_calibration.files.unpacking import unpack_file
-from dlo_calibration.files.yaml import read_first
-from dlo_calibration.messages.codec import INPUT_TYPES
+from dlo_calibration.files.record import decode, Record
+from dlo_calibration.messages.codec import INITIAL, INPUT_TYPES, NANOSECONDS, OUTPUT_TYPES
 
-SUFFIXES = ('.mcap', '.db3', '.zstd')  # of recordings in a folder
-EXPECTED = 'an MCAP file, a rosbag2 folder, or an XML request (.xml)'
-METADATA_SIZE = 10**6  # bytes; a recording of a hundred topics in a thousand files has a third
+USED_TYPES: Mapping[str, str] = {**INPUT_TYPES, **OUTPUT_TYPES}
+
+KEPT_MESSAGES = 300_000  # nearly three hours of a tracker at 30 Hz
+KEPT_OCTETS = 200 * 10**6  # of them; a tracker's chain of 21 points has 700 bytes
+KEPT_OF_ANY = 20_000  # of a file of any size; of more, each takes MESSAGE_OCTETS at least
+UNPACKED_OCTETS = 2 * 10**9  # of all messages, or UNPACKED_RATIO times the files: images pack 10 to 1
+UNPACKED_RATIO = 100
+MESSAGES_OF_ANY = 200_000  # of all topics, likewise
+MESSAGE_OCTETS = 16  # of a file, for each message: its stamp, its entry in an index
+NAMED_TOPICS = 10  # of those that are left out
+NAME_LENGTH = 255  # of a topic or a type, as ROS allows
 OPTIONS_SIZE = 10**5  # characters of recorded options; ours have 2000
+AT_ONCE = 128 * 2**20  # bytes: rosbag2's chunks have one megabyte, or one message where that is larger
+PIECE = 2**20  # bytes that are in memory while a file is unpacked
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # begins every frame; a CDR message begins with a zero
+DISCARD = re.compile(r'discard (\d{1,19}) (\d{1,19})')  # the mark of a trial that is discarded: its stamps
 
 
-def decode(record: Record) -> Any:
-    """
-    Return the message of a record, as an object with the fields of its type.
-
-    :raises InputError: where the bytes are not a message of that type.
-    """
-    try:
-        types = input_types() if record.type in DEFINITIONS else typestore()
-        return types.deserialize_cdr(record.data, record.type)
-    except Exception as error:  # damaged bytes can raise anything
-        raise InputError(
-            f'{record.name} recorded at {record.log_time / 1e9:.3f} s',
-            f'bytes that do not decode ({error!r})', f'a {record.type}',
-            'leave that message out, or record the session again') from error
-
-
-def encode(message: Any, message_type: str) -> bytes:
-    """Return the CDR bytes of a message object of the library rosbags."""
-    return bytes(typestore().serialize_cdr(message, message_type))
+class LimitExceeded(Exception):
+    """More comes out of a recording than any real one contains."""
 
 
 class Bag:
     """
-    The parts of a recording that were read so far, from one or more files.
+    The content of the files of one recording that were read so far.
 
+    :param records: the messages on topics that this package uses, as they came.
+    :param counts: number of messages by (topic, type), also of those that are not kept.
+    :param problems: one text for each defect.
     :param remap: topic -> name of the input topic as which it is read.
     """
 
-    def __init__(self, path: Path, remap: Mapping[str, str]) -> None:
-        self.path = path
-        self.intake = Intake(remap)
-        self.marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
-        self.taken_back: list[str] = []  # marks of trials that the last calibration did without; see `used`
+    def __init__(self, remap: Mapping[str, str]) -> None:
+        self.remap = remap
+        self.records: list[Record] = []
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.problems: list[str] = []
+        self._first, self._last = 2**64, -2**64  # log times of all messages [ns]
+        self._kept = 0
+        self._size = 0
+        self._messages = 0
+        self._unpacked = 0
+        self._marks: list[tuple[str, int]] = []  # each mark, and the number of records before it
         self._options: str | None = None  # the last recorded ones
+        self._left_out: set[str] = set()  # topics
         self._dropped = '{}'  # the last count of messages that the recording node dropped, as JSON
 
     @property
-    def records(self) -> list[Record]:
-        """The messages that are kept, as they came."""
-        return self.intake.records
+    def duration(self) -> float:
+        """Time from the first to the last message of all topics [s]."""
+        return max(self._last - self._first, 0) / 1e9
 
-    @property
-    def problems(self) -> list[str]:
-        """One text for each defect."""
-        return self.intake.problems
+    def open(self, size: int) -> None:
+        """Count the bytes of the next file."""
+        self._size += size
 
-    def unusable(self, came: str, expected: str, remedy: str) -> InputError:
-        """Return the error for a source that cannot be read at all."""
-        return InputError(f'session {self.path}', came, expected, remedy)
+    def unpack(self, octets: int) -> None:
+        """
+        Count bytes that a file unpacks to.
+
+        :raises LimitExceeded: if there are too many; so do `count` and `keep`.
+        """
+        self._unpacked += octets
+        limit = max(UNPACKED_OCTETS, UNPACKED_RATIO * self._size)
+        if self._unpacked > limit:
+            raise LimitExceeded(f'it unpacks to more than {limit / 1e6:.0f} MB, and has {self._size} bytes')
+
+    def count(self, topic: str, kind: str, log_time: int) -> None:
+        """Count a message of any topic, recorded at `log_time` [ns]."""
+        self.counts[topic, kind] += 1
+        self._messages += 1
+        self._first, self._last = min(self._first, log_time), max(self._last, log_time)
+        if self._messages > max(MESSAGES_OF_ANY, self._size // MESSAGE_OCTETS):
+            raise LimitExceeded(f'it has more than {self._messages - 1} messages in {self._size} bytes')
+
+    def keep(self, record: Record) -> None:
+        """Keep a message; what the node sent takes at most half of the room."""
+        limit = min(KEPT_MESSAGES, max(KEPT_OF_ANY, self._size // MESSAGE_OCTETS))
+        if record.type in OUTPUT_TYPES.values() and (
+                2 * len(self.records) >= limit or 2 * self._kept > KEPT_OCTETS):
+            return
+        self._kept += len(record.data)
+        if len(self.records) >= limit or self._kept > KEPT_OCTETS:
+            raise LimitExceeded(f'it has more than {limit} messages or {KEPT_OCTETS / 1e6:.0f} MB '
+                                'on the topics of the calibrator')
+        self.records.append(replace(record, stands_for=self.remap.get(record.topic, '')))
+
+    def leave_out(self, topic: str, encoding: str) -> None:
+        """Report that a topic is not read, as its messages are not encoded as CDR."""
+        if topic in self._left_out or len(self._left_out) > NAMED_TOPICS:
+            return
+        self._left_out.add(topic)
+        self.problems.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr'
+                             if len(self._left_out) <= NAMED_TOPICS else 'more topics are left out likewise')
+
+    def uses(self, topic: str, kind: str) -> bool:
+        """Return whether this package uses the messages on a topic, of type `kind`."""
+        return USED_TYPES.get(self.remap.get(topic) or topic.rsplit('/', 1)[-1]) == kind
+
+    def take_entries(self, entries: Mapping[str, str]) -> None:
+        """Take the entries of one of our own metadata records."""
+        self._options = entries.get('options', self._options)
+        if 'mark' in entries:
+            self._marks.append((entries['mark'], len(self.records)))
+        if 'dropped' in entries:
+            self._dropped = entries['dropped']
+
+    def options(self) -> dict[str, Any] | None:
+        """Return the last recorded options, as they stand there; None: none were recorded."""
+        if self._options is None:
+            return None
+        with suppress(ValueError, RecursionError):
+            options = json.loads(self._options[:OPTIONS_SIZE])
+            if isinstance(options, dict):
+                return options
+        self.problems.append('recorded options that cannot be read are left out')
+        return None
 
     def dropped(self) -> list[str]:
         """Return a text for each kind of message of which the recording node dropped some."""
@@ -89,154 +153,118 @@ class Bag:
         """
         Return the inputs that the last calibration used, or all where none was started.
 
-        Inputs before a reset are left out, unless none came after it.
+        Inputs before a reset are left out, unless none came after it, and those of discarded trials; the
+        problems say how many.
         """
         inputs = list(inputs)
         places = {id(record): place for place, record in enumerate(self.records)}
         newest = max((places[id(record)] for record in inputs), default=0)
-        first = max((place for mark, place in self.marks if mark == 'reset' and place <= newest), default=0)
-        last = max((place for mark, place in self.marks if mark == 'start' and place > first),
+        first = max((place for mark, place in self._marks if mark == 'reset' and place <= newest), default=0)
+        last = max((place for mark, place in self._marks if mark == 'start' and place > first),
                    default=len(self.records))
-        self.taken_back = [mark for mark, place in self.marks if first <= place < last]
-        return [record for record in inputs if first <= places[id(record)] < last]
-
-    def read(self) -> None:
-        """
-        Read the file or the folder.
-
-        :raises InputError: where nothing in it can be read.
-        """
-        try:
-            if self.path.is_dir():
-                self._read_folder()
-            else:
-                require_file(self.path, f'session {self.path}', EXPECTED)
-                self._read_file(self.path)
-        except OSError as error:
-            raise self.unusable(error.strerror or str(error), 'a file or a folder that can be read',
-                                'check the path and its permissions') from error
-
-    def _read_folder(self) -> None:
-        """Read all files of a rosbag2 folder."""
-        files = self._files()
-        if not files:
-            raise self.unusable('a folder without a recording', 'a rosbag2 folder, or an MCAP file',
-                                'name the folder that holds the metadata.yaml')
-        found = []
-        for file in files:
-            why = _unreadable(file)
-            if why:
-                self.problems.append(f'{file.name}: {why}')
-            else:
-                found.append(file)
-        if not found:
-            raise self.unusable(f'no recording that can be read ({self.problems[-1]})',
-                                'the whole rosbag2 folder', 'copy the recording with all of its files')
-        refusals = []
-        for file in found:
-            try:
-                self._read_file(file)
-            except InputError as error:
-                refusals.append(error)
-        if len(refusals) == len(found):
-            raise refusals[0]
-        self.problems.extend(str(error) for error in refusals)
-
-    def _files(self) -> list[Path]:
-        """Return the recordings of a folder that metadata.yaml names; all where it cannot be read."""
-        file = self.path / METADATA_FILE
-        names: list[str] = []
-        try:
-            why = _unreadable(file)
-            if why:
-                self.problems.append(f'{METADATA_FILE}: {why}')
-            else:
-                names = _recordings(file)
-        except OSError:
-            raise
-        except Exception:  # damaged YAML can raise anything
-            self.problems.append(
-                f'{METADATA_FILE} cannot be read; all recordings in the folder are read instead')
-        return [self.path / name for name in dict.fromkeys(names)] or sorted(
-            one for one in self.path.iterdir() if one.suffix in SUFFIXES)
-
-    def _read_file(self, file: Path) -> None:
-        """Read one recording; a defect is noted, or raised where nothing was read."""
-        before = len(self.records), sum(self.intake.counts.values())
-        try:
-            if file.suffix == '.zstd':
-                self._read_packed(file)
-            else:
-                self._read_unpacked(file, file.name)
-            return
-        except (OSError, InputError):
-            raise
-        except LimitExceeded as error:
-            text = f'{file.name} is not read to its end: {error}; the ' \
-                   f'{len(self.records) - before[0]} message(s) before that are used; split the recording'
-        except Exception as error:  # damaged files can raise anything
-            text = ' '.join(f'{type(error).__name__}: {error}'.split())
-            text = f'{file.name} is cut or damaged ({text}); ' \
-                   f'the {len(self.records) - before[0]} message(s) before that were read'
-        if sum(self.intake.counts.values()) == before[1]:
-            raise self.unusable(f'a file without a readable message ({text.partition(";")[0]})', EXPECTED,
-                                'name another file, or record it again')
-        self.problems.append(text)
-
-    def _read_packed(self, file: Path) -> None:
-        """Read a recording that rosbag2 compressed as a whole."""
-        self.intake.open(file.stat().st_size)
-        with tempfile.TemporaryDirectory(prefix='dlo_calibration_') as folder:
-            target = Path(folder) / f'recording{file.with_suffix("").suffix}'
-            unpack_file(file, target, self.intake.unpack)
-            self._read_unpacked(target, file.name)
-
-    def _read_unpacked(self, file: Path, name: str) -> None:
-        if file.suffix == '.db3':
-            read_sqlite(file, name, self.intake)
-            return
-        with file.open('rb') as stream:
-            McapFile(stream, file.stat().st_size, name, self.intake, self._take_entries).read()
-
-    def _take_entries(self, entries: Mapping[str, str]) -> None:
-        """Take the entries of one of our own metadata records."""
-        self._options = entries.get('options', self._options)
-        if 'mark' in entries:
-            self.marks.append((entries['mark'], len(self.records)))
-        if 'dropped' in entries:
-            self._dropped = entries['dropped']
-
-    def options(self) -> dict[str, Any] | None:
-        """Return the last recorded options, as they stand there; None: none were recorded."""
-        if self._options is None:
-            return None
-        try:
-            found = json.loads(self._options[:OPTIONS_SIZE])
-            if isinstance(found, dict):
-                return found
-        except (ValueError, RecursionError):
-            pass
-        self.problems.append('recorded options that cannot be read are left out')
-        return None
+        used = [record for record in inputs if first <= places[id(record)] < last]
+        if len(used) < len(inputs):
+            self.problems.append(f'{len(inputs) - len(used)} message(s) before the last reset or after the '
+                                 'last start are left out, as the live calibration did not use them')
+        discards = [(int(match[1]), int(match[2])) for mark, place in self._marks
+                    if first <= place < last and (match := DISCARD.fullmatch(mark))]
+        if not discards:
+            return used
+        discarded = _discarded(used, discards)
+        self.problems.append(f'{len(discarded)} message(s) of {len(discards)} trial(s) that were taken back '
+                             'are left out')
+        return [record for k, record in enumerate(used) if k not in discarded]
 
 
-def _unreadable(file: Path) -> str:
-    """Return why a file of a folder is not to be read, if there is a reason."""
-    if file.is_symlink() and file.resolve().parent != file.parent.resolve():
-        return 'it is left out, as it is a link out of the folder; name the file it leads to'
-    if not file.exists():
-        return 'it is missing' + ('' if file.name == METADATA_FILE else f', though {METADATA_FILE} names it')
-    return '' if file.is_file() else 'it is left out, as it is no regular file'
+def _discarded(records: list[Record], discards: Iterable[tuple[int, int]]) -> set[int]:
+    """
+    Return the indices of the messages of discarded trials, each given by its first and last stamp [ns].
+
+    The collector leaves out the same ones: all that are stamped within such a trial, and what comes after it
+    before the next initial chain.
+    """
+    stamped = []
+    for k, record in enumerate(records):
+        with suppress(InputError):  # one that does not decode is reported later
+            stamp = decode(record).header.stamp
+            stamped.append((stamp.sec * NANOSECONDS + stamp.nanosec, record.name != INITIAL, k))
+    stamped.sort()
+    discarded: set[int] = set()
+    for first, last in discards:
+        follows = False  # whether the newest initial chain is that of the trial
+        for stamp, later, k in stamped:
+            follows = follows and later or first <= stamp <= last
+            if follows and stamp >= first:
+                discarded.add(k)
+    return discarded
 
 
-def _recordings(file: Path) -> list[str]:
-    """Return the names of the recordings in a metadata.yaml; its damages can raise anything."""
-    with file.open('rb') as stream:
-        octets = stream.read(METADATA_SIZE + 1)
-    if len(octets) > METADATA_SIZE:
-        raise ValueError('too large')
-    whole = read_first(octets)
-    names = whole[METADATA_KEY].get('relative_file_paths') or []
-    if not isinstance(names, list):
-        raise ValueError('no list of files')
-    return [PurePath(name).name for name in names]
+def full_name(name: str) -> str:
+    """Return ``package/msg/Type``, also for the short form ``package/Type`` of some writers."""
+    package, slash, kind = name.partition('/')
+    return f'{package}/msg/{kind}' if slash and '/' not in kind else name
+
+
+def unpacked(packed: bytes, compression: str, size: int) -> bytes:
+    """
+    Return the content of a chunk.
+
+    :param compression: as MCAP names it: empty, ``zstd`` or ``lz4``.
+    :param size: of the content [bytes], as announced; more is never made of it.
+    :raises Exception: of any kind, where it is damaged, or has another size.
+    """
+    content = packed
+    if compression == 'zstd':
+        content = _zstd(packed, size)
+    elif compression == 'lz4':
+        import lz4.frame
+
+        content = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+    elif compression:
+        raise ValueError(f'unknown compression {compression[:20]!r}')
+    if len(content) != size:
+        raise ValueError('its size is not as announced')
+    return content
+
+
+def unpacked_message(octets: bytes, allow: Callable[[int], None]) -> bytes:
+    """
+    Return the CDR bytes of a message, which rosbag2 may have compressed alone; damaged ones unchanged.
+
+    :param allow: called with the number of bytes that unpacking makes; raises where they are too many.
+    """
+    if octets[:4] != ZSTD_MAGIC:
+        return octets
+    import zstandard
+
+    size, content = zstandard.CONTENTSIZE_UNKNOWN, octets
+    with suppress(Exception):  # damaged bytes can raise anything; that they do not decode is said later
+        size = zstandard.get_frame_parameters(octets).content_size
+        content = _zstd(octets, min(size, AT_ONCE))
+    unpacked_whole = size == zstandard.CONTENTSIZE_UNKNOWN and content is not octets
+    allow(len(content) if unpacked_whole else min(size, AT_ONCE))
+    return content
+
+
+def unpack_file(packed: Path, target: Path, allow: Callable[[int], None]) -> None:
+    """
+    Write the content of a file that rosbag2 compressed.
+
+    :param allow: called with the number of bytes before they are written; raises where they are too many.
+    """
+    import zstandard
+
+    with packed.open('rb') as source, target.open('xb') as sink:
+        for piece in zstandard.ZstdDecompressor().read_to_iter(source, write_size=PIECE):
+            allow(len(piece))
+            sink.write(piece)
+
+
+def _zstd(packed: bytes, size: int) -> bytes:
+    import zstandard
+
+    # The library believes the frame's own announcement, and asks for that much memory.
+    declared = zstandard.get_frame_parameters(packed).content_size
+    if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        raise ValueError('its size is not as announced')
+    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=max(size, 1)) if size else b''

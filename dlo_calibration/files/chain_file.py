@@ -11,16 +11,16 @@ import numpy as np
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.xml import (
-    add_chain,
+    add_points,
     document,
     new_root,
     parse,
     read_chain,
     read_octets,
-    write_octets,
 )
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.model.quantity import exact
+from dlo_calibration.model.parameters import exact
+from dlo_calibration.writing import write_file
 
 WHAT, ROOT = 'chain', 'point_chain'
 LARGEST_CSV = 2**20  # bytes; a chain has far fewer
@@ -34,10 +34,9 @@ def chain_csv(chain: Chain) -> bytes:
 
 def chain_xml(chain: Chain) -> bytes:
     """Return a chain as an XML document."""
-    holder = new_root('holder')
-    element = add_chain(holder, ROOT, chain, version='1')
-    holder.remove(element)
-    return document(element)
+    root = new_root(ROOT, version=1)
+    add_points(root, chain)
+    return document(root)
 
 
 def write_chain(path: str | Path, chain: Chain) -> None:
@@ -46,7 +45,7 @@ def write_chain(path: str | Path, chain: Chain) -> None:
 
     :raises InputError: where the file cannot be written.
     """
-    write_octets(path, chain_xml(chain) if Path(path).suffix.lower() == '.xml' else chain_csv(chain))
+    write_file(path, chain_xml(chain) if Path(path).suffix.lower() == '.xml' else chain_csv(chain))
 
 
 def read_chain_file(path: str | Path) -> Chain:

@@ -2,81 +2,161 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-McapFile: reads an MCAP file record by record, around damaged places.
+MCAP file: read record by record, around damaged places.
 
-A wrong bit costs at most the messages of the chunk that it is in.  Records are read by
-hand, not with the library mcap: it ends at the first damaged place, and makes a chunk
-or a table as large as the file says.
+A wrong bit costs at most the messages of the chunk that it is in.  A file is a chain of records: kind,
+length, content; one wrong length would hide all that follows.  The contents have lengths of their own, so
+that a record can be checked by its form, and the next one is found by searching for a record in good form.
+
+Records are read by hand, as the reader of the library mcap ends at the first damaged place, unpacks a chunk
+to whatever size its compressed bytes say, and lists all messages of a chunk before it gives the first one;
+its limit bounds only the size of a record in the file.
+
+The format is specified at https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from io import BytesIO
+import re
 import struct
-from typing import BinaryIO, Callable, Iterator, Mapping
+from typing import BinaryIO, Iterator
 from zlib import crc32
 
-from dlo_calibration.files.intake import full_name, Intake, LimitExceeded, NAME_LENGTH, Record
-from dlo_calibration.files.mcap_form import (
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    FOOTER,
-    FORMS,
-    HEAD,
-    MAGIC,
-    McapForm,
-    MESSAGE,
-    MESSAGE_HEAD,
-    METADATA,
-    SCHEMA,
-    STATISTICS,
+from dlo_calibration.files.bag import (
+    AT_ONCE,
+    Bag,
+    full_name,
+    LimitExceeded,
+    NAME_LENGTH,
+    unpacked,
+    unpacked_message,
 )
+from dlo_calibration.files.record import Record
 from dlo_calibration.files.recording import OUR_RECORD
-from dlo_calibration.files.unpacking import AT_ONCE, unpacked, unpacked_message
 
+MAGIC = b'\x89MCAP0\r\n'
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, \
+    STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(1, 16)
+HEAD = struct.Struct('<BQ')  # of every record: its kind, and the length of its content
+MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
+
+#: Content of each kind of record: numbers of bytes, and I or Q where a length of that type, with so
+#: many bytes after it, stands.  What follows the head of a message fills it.
+FORMS: dict[int, tuple[int | str, ...]] = {
+    HEADER: ('I', 'I'), FOOTER: (20,), SCHEMA: (2, 'I', 'I', 'I'), CHANNEL: (4, 'I', 'I', 'I'),
+    MESSAGE: (MESSAGE_HEAD.size,), CHUNK: (28, 'I', 'Q'), MESSAGE_INDEX: (2, 'I'),
+    CHUNK_INDEX: (32, 'I', 8, 'I', 16), ATTACHMENT: (16, 'I', 'I', 'Q', 4), ATTACHMENT_INDEX: (40, 'I', 'I'),
+    STATISTICS: (42, 'I'), METADATA: ('I', 'I'), METADATA_INDEX: (16, 'I'), SUMMARY_OFFSET: (17,),
+    DATA_END: (4,)}
+
+#: A place where a record of less than 4 GB may begin.
+CANDIDATE = re.compile(rb'(?=[\x01-\x0f].{4}\0{4})', re.DOTALL)
+WINDOW = 2**20  # bytes that are searched at once
+CANDIDATES = 1_000_000  # places that are checked in one file: a second or two
 DESCRIPTION_SIZE = 2**20  # bytes read of a channel, a schema or one of our own records: names and options
 CHUNK_HEAD = struct.Struct('<QQQII')  # times of the first and last message, size, CRC, length of a name
-TOLD = 3  # damaged places that are named
-LEFT_OUT = 10  # topics likewise
+NAMED_PLACES = 3  # damaged ones, in a problem
 
 
-@dataclass
-class _Channel:
-    """A topic of the file; `wanted`: this package uses its messages, so that they are kept."""
+class McapRecords:
+    """
+    The places of the records in a stream.
 
-    topic: str
-    type: str
-    encoding: str
-    wanted: bool
+    :param end: where they end [bytes].
+    """
+
+    def __init__(self, stream: BinaryIO, end: int) -> None:
+        self._stream = stream
+        self._candidates = 0
+        self.end = end
+
+    def bytes_at(self, place: int, count: int) -> bytes:
+        """Return `count` bytes, or fewer at the end of the stream."""
+        self._stream.seek(max(place, 0))
+        return self._stream.read(count)
+
+    def head(self, place: int) -> tuple[int, int] | None:
+        """Return kind and length of the record at a place; None where none can be."""
+        octets = self.bytes_at(place, HEAD.size)
+        if len(octets) < HEAD.size:
+            return None
+        kind, length = HEAD.unpack(octets)
+        return (kind, length) if kind and place + HEAD.size + length <= self.end else None
+
+    def description(self, place: int, length: int) -> bytes:
+        """Return the content of a record that describes a topic or is one of our own."""
+        return self.bytes_at(place + HEAD.size, min(length, DESCRIPTION_SIZE))
+
+    def surplus(self, place: int, kind: int, length: int) -> int | None:
+        """
+        Return how many bytes a record has after the content that its kind needs.
+
+        It is 0 for every record of today's format, except messages; None: it is not in the form of its kind.
+        """
+        at, stop = place + HEAD.size, place + HEAD.size + length
+        for part in FORMS.get(kind, ()):
+            if isinstance(part, str):
+                code = '<' + part
+                octets = self.bytes_at(at, struct.calcsize(code))
+                if len(octets) < struct.calcsize(code):
+                    return None
+                at += len(octets) + struct.unpack(code, octets)[0]
+            else:
+                at += part
+            if at > stop:
+                return None
+        return stop - at
+
+    def sound(self, place: int) -> bool:
+        """Return whether a record in good form begins at a place, or the stream ends there."""
+        if place == self.end:
+            return True
+        head = self.head(place)
+        if head is None or head[0] not in FORMS:
+            return False
+        surplus = self.surplus(place, *head)
+        return surplus is not None and (surplus == 0 or head[0] == MESSAGE)
+
+    def next_sound(self, place: int) -> int | None:
+        """Return the first place, from `place` on, where a record in good form begins and another follows."""
+        for begin in range(place, self.end, WINDOW):
+            for match in CANDIDATE.finditer(self.bytes_at(begin, WINDOW + HEAD.size - 1)):
+                self._candidates += 1
+                if self._candidates > CANDIDATES:
+                    return None
+                at = begin + match.start()
+                head = self.head(at)
+                if head is not None and self.sound(at) and self.sound(at + HEAD.size + head[1]):
+                    return at
+        return None
 
 
 class McapFile:
     """
-    An MCAP file, and what was found in it.
+    An MCAP file, and what was read of it.
 
     :param size: of the stream [bytes].
     :param name: of the file, for the descriptions of problems.
-    :param intake: takes the messages.
-    :param take_entries: called with the entries of each metadata record of our own.
+    :param bag: takes the messages, and the entries of our own metadata records.
     """
 
-    def __init__(self, stream: BinaryIO, size: int, name: str, intake: Intake,
-                 take_entries: Callable[[Mapping[str, str]], None]) -> None:
-        self._form = McapForm(stream, size)
-        self._name, self._intake, self._take_entries = name, intake, take_entries
+    def __init__(self, stream: BinaryIO, size: int, name: str, bag: Bag) -> None:
+        self._form = form = McapRecords(stream, size)
+        if form.bytes_at(size - len(MAGIC), len(MAGIC)) == MAGIC:
+            form.end -= len(MAGIC)
+        self._name, self._bag = name, bag
         self._schemas: dict[int, list[str]] = {}
-        self._channels: dict[int, _Channel] = {}
+        self._channels: dict[int, tuple[str, str, str]] = {}  # topic, type and encoding of each
         self._promised: int | None = None  # number of messages by the file's statistics
         self._messages = 0
         self._strange: set[int] = set()  # channels that are not described
         self._damage: list[str] = []  # the first damaged places
         self._damaged = 0
-        self._left_out: list[str] = []  # a text for each topic of another encoding
 
     def read(self) -> None:
         """
-        Read all that can be read; what cannot is described in the problems of the intake.
+        Read all that can be read; what cannot is described in the problems of the bag.
 
         :raises ValueError: where it is no MCAP file.
         :raises LimitExceeded: where more comes out of it than of any real recording.
@@ -85,7 +165,7 @@ class McapFile:
             if not self._form.sound(len(MAGIC)):
                 raise ValueError('it does not begin as an MCAP file does')
             self._note('its first bytes')
-        self._intake.open(self._form.end)
+        self._bag.open(self._form.end)
         self._read_summary()
         try:
             self._read_records()
@@ -97,7 +177,7 @@ class McapFile:
 
     def _note(self, damage: str) -> None:
         self._damaged += 1
-        if len(self._damage) < TOLD:
+        if len(self._damage) < NAMED_PLACES:
             self._damage.append(damage)
 
     def _read_summary(self) -> None:
@@ -106,30 +186,25 @@ class McapFile:
         if self._form.head(place) != (FOOTER, 20):
             return
         place, = struct.unpack('<Q', self._form.bytes_at(place + HEAD.size, 8))
-        while 0 < place < self._form.end and self._form.sound(place):
-            head = self._form.head(place)
-            if head is None:
-                return
+        while 0 < place < self._form.end and self._form.sound(place) and (head := self._form.head(place)):
             kind, length = head
             if kind in (SCHEMA, CHANNEL):
-                self._describe_topic(kind, self._content(place, length))
+                self._describe_topic(kind, self._form.description(place, length))
             elif kind == STATISTICS:
                 self._promised, = struct.unpack('<Q', self._form.bytes_at(place + HEAD.size, 8))
             place += HEAD.size + length
 
-    def _content(self, place: int, length: int) -> bytes:
-        return self._form.bytes_at(place + HEAD.size, min(length, DESCRIPTION_SIZE))
-
     def _read_records(self) -> None:
         for place, kind, length in self._records():
             if kind in (SCHEMA, CHANNEL):
-                self._describe_topic(kind, self._content(place, length))
+                self._describe_topic(kind, self._form.description(place, length))
             elif kind == CHUNK:
                 self._read_chunk(place, length)
             elif kind == MESSAGE:
-                self._read_message(place, length)
+                self._bag.unpack(length)
+                self._read_message(self._form, place, length)
             elif kind == METADATA:
-                self._read_metadata(self._content(place, length))
+                self._read_metadata(self._form.description(place, length))
             elif kind == DATA_END:
                 self._check_whole(place, *struct.unpack('<I', self._form.bytes_at(place + HEAD.size, 4)))
             elif kind not in FORMS:
@@ -142,24 +217,24 @@ class McapFile:
             head = form.head(place)
             surplus = None if head is None else form.surplus(place, *head)
             if head is None or surplus is None:
-                found = form.next_sound(place + 1)
+                resumed = form.next_sound(place + 1)
             else:
                 kind, length = head
                 following = place + HEAD.size + length
                 whole = surplus == 0 and kind != MESSAGE
-                found = following if whole or form.sound(following) else form.next_sound(place + 1)
+                resumed = following if whole or form.sound(following) else form.next_sound(place + 1)
                 # A sound one behind the following place: this length is right, the following record damaged.
-                if whole or found is not None and found >= following:
+                if whole or resumed is not None and resumed >= following:
                     yield place, kind, length
                 if whole and kind in (DATA_END, FOOTER):
                     return
-                if found == following:
-                    place = found
+                if resumed == following:
+                    place = resumed
                     continue
-            if found is None:
+            if resumed is None:
                 break
             self._note(f'records at byte {place}')
-            place = found
+            place = resumed
         self._note('the file ends too early')
 
     def _read_chunk(self, place: int, length: int) -> None:
@@ -168,68 +243,54 @@ class McapFile:
         try:
             if length > AT_ONCE or size > AT_ONCE:
                 raise ValueError(f'more than {AT_ONCE} bytes at once')
+            self._bag.unpack(size)  # before, as one that turns out to be damaged takes as long
             compression = self._form.bytes_at(at, name).decode()
             content = unpacked(self._form.bytes_at(at + name + 8, length - CHUNK_HEAD.size - name - 8),
                                compression, size)
             if crc and crc32(content) != crc:
                 raise ValueError('its checksum differs')
+        except LimitExceeded:
+            raise
         except Exception as error:  # damaged bytes can raise anything
             text = ' '.join(f'{error}'.split())[:100]
             self._note(f'the chunk at byte {place}: {text}')
             return
-        self._intake.unpack(len(content))
-        if not self._take_content(content, crc != 0):
+        if not self._read_content(McapRecords(BytesIO(content), size), crc != 0):
             self._note(f'records in the chunk at byte {place}')
 
-    def _take_content(self, content: bytes, sure: bool) -> bool:
+    def _read_content(self, form: McapRecords, sure: bool) -> bool:
         """Read the records of a chunk; return whether they fill it. `sure`: it had a checksum."""
-        place, size = 0, len(content)
-        while place + HEAD.size <= size:
-            kind, length = HEAD.unpack_from(content, place)
-            begin = place + HEAD.size
-            place = begin + length
-            if place > size:
-                return False
+        place = 0
+        while (head := form.head(place)) is not None:
+            kind, length = head
             if kind == MESSAGE and length >= MESSAGE_HEAD.size:
-                number, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, begin)
-                channel = self._count(number, log_time)
-                if channel is not None:
-                    self._keep(channel, content[begin + MESSAGE_HEAD.size:place], log_time)
+                self._read_message(form, place, length)
             elif kind in (SCHEMA, CHANNEL):
-                self._describe_topic(kind, content[begin:min(place, begin + DESCRIPTION_SIZE)], sure)
+                self._describe_topic(kind, form.description(place, length), sure)
             elif kind in FORMS:  # others are not allowed in a chunk; unknown ones are
                 return False
-        return place == size
+            place += HEAD.size + length
+        return place == form.end
 
-    def _read_message(self, place: int, length: int) -> None:
+    def _read_message(self, form: McapRecords, place: int, length: int) -> None:
+        """Count a message of the file or of a chunk; keep it if this package uses it."""
         at = place + HEAD.size
-        number, _, log_time, _ = MESSAGE_HEAD.unpack(self._form.bytes_at(at, MESSAGE_HEAD.size))
-        self._intake.unpack(length)
-        channel = self._count(number, log_time)
-        if channel is not None and length > AT_ONCE:
-            self._note(f'a message of {length} bytes at byte {place}')
-        elif channel is not None:
-            octets = self._form.bytes_at(at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size)
-            self._keep(channel, octets, log_time)
-
-    def _count(self, number: int, log_time: int) -> _Channel | None:
-        """Count a message of a channel; return the channel if the message is to be kept."""
+        number, _, log_time, _ = MESSAGE_HEAD.unpack(form.bytes_at(at, MESSAGE_HEAD.size))
         self._messages += 1
-        channel = self._channels.get(number)
-        if channel is None:
+        if number not in self._channels:
             self._strange.add(number)
-            return None
-        if channel.encoding != 'cdr':
-            return None
-        self._intake.count(channel.topic, channel.type, log_time)
-        return channel if channel.wanted else None
-
-    def _keep(self, channel: _Channel, octets: bytes, log_time: int) -> None:
-        try:
-            octets = unpacked_message(octets)
-        except Exception:  # damaged bytes can raise anything; they do not decode, which is told then
-            pass
-        self._intake.keep(Record(channel.topic, channel.type, octets, log_time))
+            return
+        topic, name, encoding = self._channels[number]
+        if encoding != 'cdr':
+            return
+        self._bag.count(topic, name, log_time)
+        if not self._bag.uses(topic, name):
+            return
+        if length > AT_ONCE:
+            self._note(f'a message of {length} bytes at byte {place}')
+            return
+        octets = form.bytes_at(at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size)
+        self._bag.keep(Record(topic, name, unpacked_message(octets, self._bag.unpack), log_time))
 
     def _describe_topic(self, kind: int, content: bytes, sure: bool = False) -> None:
         """
@@ -255,14 +316,16 @@ class McapFile:
         except (struct.error, ValueError):
             self._note('the description of a topic')
             return
-        known = self._channels.get(number)
-        choice = [_Channel(topic, name, encoding, encoding == 'cdr' and self._intake.uses(topic, name))
-                  for name in self._schemas.get(schema, [''])]
-        found = next((one for one in choice if one.wanted), choice[0])
-        if known is None or sure or found.wanted and not known.wanted:
-            self._channels[number] = found
-            if encoding != 'cdr' and known is None:
-                self._left_out.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr')
+        names = self._schemas.get(schema, [''])
+        used = [name for name in names if self._wanted(topic, name, encoding)]
+        new = number not in self._channels
+        if new or sure or used and not self._wanted(*self._channels[number]):
+            self._channels[number] = topic, [*used, *names][0], encoding
+            if encoding != 'cdr' and new:
+                self._bag.leave_out(topic, encoding)
+
+    def _wanted(self, topic: str, name: str, encoding: str) -> bool:
+        return encoding == 'cdr' and self._bag.uses(topic, name)
 
     def _read_metadata(self, content: bytes) -> None:
         """Pass the entries of a record of our own on."""
@@ -278,33 +341,29 @@ class McapFile:
         except (struct.error, ValueError):
             self._note('recorded options or marks')
         else:
-            self._take_entries(entries)
+            self._bag.take_entries(entries)
 
     def _check_whole(self, end: int, expected: int) -> None:
-        """Compare the checksum of the records up to `end`, if there is one and no other damage was found."""
+        """Compare the checksum of the records up to `end`, if there is one and there is no other damage."""
         if not expected or self._damage:
             return
-        found, piece = 0, 2**20
+        checksum, piece = 0, 2**20
         for place in range(0, end, piece):
-            found = crc32(self._form.bytes_at(place, min(piece, end - place)), found)
-        if found != expected:
+            checksum = crc32(self._form.bytes_at(place, min(piece, end - place)), checksum)
+        if checksum != expected:
             self._note('its checksum differs')
 
     def _describe(self) -> None:
-        """Describe what is left out, and in one problem what is damaged or missing."""
-        more = len(self._left_out) - LEFT_OUT
-        self._intake.problems += self._left_out[:LEFT_OUT]
-        if more > 0:
-            self._intake.problems.append(f'{more} more topics are left out likewise')
+        """Describe in one problem what is damaged or missing."""
         if self._strange:
             self._note(f'messages of {len(self._strange)} topic(s) without a description')
         missing = (self._promised or 0) - self._messages
         if not self._damage and missing <= 0:
             return
         places = '; '.join(self._damage) or 'messages are missing'
-        more = self._damaged - TOLD
+        more = self._damaged - NAMED_PLACES
         count = f'{self._messages} of its {self._promised}' if missing > 0 else f'{self._messages}'
-        self._intake.problems.append(
+        self._bag.problems.append(
             f'{self._name} is cut or damaged ({places}{f"; and {more} more" if more > 0 else ""}); '
             f'{count} message(s) were read')
 

@@ -11,23 +11,21 @@ Foxglove and the library rosbags can read it.
 
 from __future__ import annotations
 
-from contextlib import suppress
-from functools import lru_cache
+from contextlib import contextmanager, suppress
 from io import StringIO
 import json
 from pathlib import Path
 from textwrap import indent
 import time
-from typing import Any, BinaryIO, cast, Mapping
+from typing import Any, BinaryIO, cast, Iterable, Iterator, Mapping
 
 import mcap  # noqa: F401  # required; its writer takes long to load, and who only reads needs none
-from rosbags.typesys import get_typestore, Stores
-from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 
-from dlo_calibration.calibration.file_options import recordable
+from dlo_calibration.calibration.options import recordable
 from dlo_calibration.errors import DloCalibrationError
-from dlo_calibration.writing import replacing
+from dlo_calibration.files.record import Record, typestore
+from dlo_calibration.writing import replacing, whole
 
 OUR_RECORD = 'dlo_calibration'  # name of our metadata records in the MCAP file
 METADATA_FILE = 'metadata.yaml'  # name and key are rosbag2's
@@ -37,12 +35,6 @@ LATCHED = ('result', 'status', 'dlo_description', 'markers')  # late subscribers
 
 class RecordingError(DloCalibrationError):
     """A session can no longer be written (disk full, no permission, ...)."""
-
-
-@lru_cache(maxsize=1)
-def typestore() -> Typestore:
-    """Return the message definitions of Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
 
 
 class SessionWriter:
@@ -56,12 +48,13 @@ class SessionWriter:
     :param path: the folder to create, or, if it ends in ``.mcap``, a single file
         without folder and metadata.yaml; parent folders are created too.
     :param options: as for `write_options`; None: written later or never.
+    :ivar failure: why nothing can be written any more; empty: it can.
     :raises RecordingError: here and in every method, where writing fails.
         Nothing is written after the first such error.
     """
 
     def __init__(self, path: str | Path, options: Mapping[str, Any] | None = None) -> None:
-        self._failure = ''
+        self.failure = ''
         self._epoch = time.time_ns() - time.monotonic_ns()
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
@@ -87,11 +80,6 @@ class SessionWriter:
             raise
         if options is not None:
             self.write_options(options)
-
-    @property
-    def failed(self) -> bool:
-        """Whether nothing can be written any more."""
-        return bool(self._failure)
 
     def write(self, topic: str, message_type: str, data: bytes, log_time: int | None = None,
               flush: bool = True) -> None:
@@ -121,16 +109,20 @@ class SessionWriter:
                 self._write_metadata_file()
 
     def write_options(self, options: Mapping[str, Any]) -> None:
-        """Record the current options, by name, but for those of the machine: a replay uses the same ones."""
+        """Record the current options, by name, for a replay; those of the machine are left out."""
         self._write_metadata_record('options', json.dumps(recordable(options), sort_keys=True))
 
     def write_mark(self, mark: str) -> None:
         """
-        Record the start of a calibration, a reset, which forgets the trials, or that one was taken back.
+        Record what decides which messages a result uses.
 
-        :param mark: ``start``, ``reset``, or `taken_back.mark`: what decides which messages a result uses.
+        :param mark: ``start`` of a calibration, or ``reset``, which forgets the trials; see `write_discard`.
         """
         self._write_metadata_record('mark', mark)
+
+    def write_discard(self, first: int, last: int) -> None:
+        """Record that a trial is discarded, whose messages are stamped from `first` to `last` [ns]."""
+        self.write_mark(f'discard {first} {last}')
 
     def write_dropped(self, counts: Mapping[str, int]) -> None:
         """Record how many messages of each kind were dropped since the session began."""
@@ -143,11 +135,9 @@ class SessionWriter:
 
     def close(self) -> None:
         """Write the index and the final metadata.yaml; closing twice does nothing."""
-        if self._closed:
+        if self._closed or self.failure:
             return
         self._closed = True
-        if self._failure:
-            return
         with self._disk():
             self._writer.flush()
             self._writer.add_metadata('rosbag2', {'serialized_metadata': self._metadata()})
@@ -163,18 +153,18 @@ class SessionWriter:
         """Close."""
         self.close()
 
-    def _disk(self) -> _Disk:
-        if self._failure:
-            raise RecordingError(self._failure)
-        return _Disk(self)
-
-    def _fail(self, error: OSError | ValueError) -> RecordingError:
-        self._failure = f'session {self.path}: cannot be written: {error}; recording ends here'
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        """Turn errors of the disk into RecordingError, and write nothing after the first one."""
+        if self.failure:
+            raise RecordingError(self.failure)
         try:
-            self._stream.close()
-        except OSError:
-            pass  # the first error is the one to report
-        return RecordingError(self._failure)
+            yield
+        except (OSError, ValueError) as error:  # ValueError: the stream is closed
+            self.failure = f'session {self.path}: cannot be written: {error}; recording ends here'
+            with suppress(OSError):  # the first error is the one to report
+                self._stream.close()
+            raise RecordingError(self.failure) from error
 
     def _write_metadata_record(self, key: str, text: str) -> None:
         with self._disk():
@@ -189,7 +179,7 @@ class SessionWriter:
                 message_type, 'ros2msg', definition.encode())
         self._channels[topic, message_type] = self._writer.register_channel(
             topic, 'cdr', self._schemas[message_type],
-            {'offered_qos_profiles': _qos_text(_is_latched(topic)),
+            {'offered_qos_profiles': _yaml([_qos(topic)]),
              'topic_type_hash': typestore().hash_rihs01(message_type)})
         self._counts[topic, message_type] = 0
 
@@ -200,18 +190,18 @@ class SessionWriter:
         times: dict[str, Any] = {
             'duration': {'nanoseconds': self._last - self._first if count else 0},
             'starting_time': {'nanoseconds_since_epoch': self._first}}
-        text = _yaml({
+        return _yaml({
             'version': 9, 'storage_identifier': 'mcap', **times, 'message_count': count,
-            'topics_with_message_count': [],
+            'topics_with_message_count': [
+                {'message_count': messages, 'topic_metadata': {
+                    'name': topic, 'type': message_type, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': [_qos(topic)],
+                    'type_description_hash': typestore().hash_rihs01(message_type)}}
+                for (topic, message_type), messages in self._counts.items()],
             'compression_format': '', 'compression_mode': '',
             'relative_file_paths': [self.file.name],
             'files': [{'path': self.file.name, **times, 'message_count': count}],
             'custom_data': {}, 'ros_distro': 'jazzy'})
-        # YAML takes milliseconds, while the node listens: what it says of a topic is made once.
-        topics = ''.join(f'\n- message_count: {self._counts[key]}\n{_topic_text(*key)}'
-                         for key in self._channels) or ' []'
-        place = '\ntopics_with_message_count:'  # a name has no line break there
-        return text.replace(f'{place} []', f'{place}{topics}')
 
     def _write_metadata_file(self) -> None:
         """Replace metadata.yaml at once, so that it is never incomplete."""
@@ -222,18 +212,16 @@ class SessionWriter:
             new.write_text(f'{METADATA_KEY}:\n{indent(self._metadata(), "  ")}\n', encoding='utf-8')
 
 
-class _Disk:
-    """A context that turns errors of the disk into RecordingError."""
+def write_records(path: Path, records: Iterable[Record], options: Mapping[str, Any] | None) -> None:
+    """
+    Write records to one MCAP file.
 
-    def __init__(self, writer: SessionWriter) -> None:
-        self._writer = writer
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (OSError, ValueError)):  # ValueError: the stream is closed
-            raise self._writer._fail(error) from error
+    :param options: by name, to be recorded; None: none are.
+    :raises InputError: where the file cannot be written.
+    """
+    with whole(path) as new, SessionWriter(new, options) as writer:
+        for record in records:
+            writer.write(record.topic, record.type, record.data, record.log_time, flush=False)
 
 
 def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
@@ -257,24 +245,9 @@ def _create(path: Path) -> tuple[Path, Path, BinaryIO]:
     raise OSError(f'{path} and its numbered names all exist')
 
 
-def _is_latched(topic: str) -> bool:
-    return topic.rsplit('/', 1)[-1] in LATCHED
-
-
-@lru_cache
-def _topic_text(topic: str, message_type: str) -> str:
-    return indent(_yaml({'topic_metadata': {
-        'name': topic, 'type': message_type, 'serialization_format': 'cdr',
-        'offered_qos_profiles': [_qos(_is_latched(topic))],
-        'type_description_hash': typestore().hash_rihs01(message_type)}}), '  ')
-
-
-@lru_cache
-def _qos_text(latched: bool) -> str:
-    return _yaml([_qos(latched)])
-
-
-def _qos(latched: bool) -> dict[str, Any]:
+def _qos(topic: str) -> dict[str, Any]:
+    """Return the quality of service with which a topic is offered, in rosbag2's form."""
+    latched = topic.rsplit('/', 1)[-1] in LATCHED
     forever = {'sec': 9223372036, 'nsec': 854775807}  # rmw's infinite duration
     return {'history': 'keep_last', 'depth': 1 if latched else 10, 'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',

@@ -22,28 +22,19 @@ import numpy as np
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.xml import (
-    add,
-    add_chain,
-    add_options,
-    document,
-    finite,
-    new_root,
-    number,
-    parse,
-    read_chain,
-    read_octets,
-    read_options,
-    read_vectors,
-    refused,
-    write_octets,
-)
-from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION
+from dlo_calibration.files import xml
+from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME, NO_ROTATION, PATHS
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, length_change
-from dlo_calibration.model.manipulation import in_steps, Manipulation, PATHS, Timed
-from dlo_calibration.model.named_actions import NAMED_ACTIONS, NamedAction
+from dlo_calibration.model.named_actions import (
+    Manipulation,
+    manipulation_of,
+    NAMED_ACTIONS,
+    NamedAction,
+    TimedAction,
+)
 from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.writing import write_file
 
 WHAT = 'request'  # in errors
 TURNS = ('qx', 'qy', 'qz', 'qw')  # attributes of a waypoint
@@ -84,7 +75,7 @@ class TrialRequest:
     def __post_init__(self) -> None:
         if self.velocity is not None:
             object.__setattr__(self, 'velocity', frozen_array(self.velocity))
-        names = {name for action in self.actions for name in _hand_names(action)}
+        names = {name for action in self.actions for name in action.hand_names}
         names.update(name for goal in self.goals for name in goal.held_by or ())
         for name in names:
             # XML attributes can hold these characters, and a list of names has blanks between them.
@@ -99,15 +90,15 @@ class TrialRequest:
     @classmethod
     def of(cls, trial: Trial) -> TrialRequest:
         """Return the request for an observed trial."""
-        goals = tuple(GoalRequest(one.chain, one.time, one.stable, one.held_by) for one in trial.goals)
+        goals = tuple(GoalRequest(goal.chain, goal.time, goal.stable, goal.held_by) for goal in trial.goals)
         return cls(trial.name, trial.initial, trial.actions, goals, trial.velocity)
 
     def moved(self, pose: Pose) -> TrialRequest:
         """Return the trial in the table's frame, in which the frame of the request has a pose."""
         return replace(
             self, initial=pose.chain(self.initial), actions=tuple(
-                pose.action(one) if isinstance(one, Action) else pose.named_action(one)
-                for one in self.actions),
+                pose.action(action) if isinstance(action, Action) else pose.named_action(action)
+                for action in self.actions),
             goals=tuple(replace(goal, chain=pose.chain(goal.chain)) for goal in self.goals),
             velocity=None if self.velocity is None else pose.vectors(self.velocity))
 
@@ -120,17 +111,18 @@ class TrialRequest:
         :raises InputError: where an action is impossible.
         """
         done: list[Action] = []
-        holds: list[tuple[float, tuple[str, ...], bool]] = []
-        for one in self._in_order():
-            if isinstance(one, NamedAction):
-                action, hold = one.action(self._seen(one.start), done), one.hold
+        holds = []
+        for requested in self._in_order():
+            if isinstance(requested, NamedAction):
+                action, hold = requested.action(self._seen(requested.start), done), requested.hold
             else:
-                action, hold = one, not release
+                action, hold = requested, not release
             done.append(action)
-            holds.append((action.end, tuple(hand.name for hand in action.hands), hold))
+            holds.append(hold)
         goals = []
         for goal in self.goals:
-            last = {name: hold for end, names, hold in holds if end < goal.time for name in names}
+            last = {name: hold for action, hold in zip(done, holds, strict=True) if action.end < goal.time
+                    for name in action.hand_names}
             held_by = goal.held_by
             if held_by is None:
                 held_by = tuple(name for name, hold in last.items() if hold)
@@ -139,27 +131,30 @@ class TrialRequest:
 
     def manipulation(self, release: bool = True) -> Manipulation:
         """
-        Return what the hands do, in which named actions wait for the predicted chain.
+        Return the manipulation; its named actions start from the predicted chain.
 
         :param release: as of `trial`.
         """
         done: list[Action] = []
         timed = []
-        for one in self._in_order():
-            end, hold = one.start, not release
-            if isinstance(one, NamedAction):
-                hold = one.hold
+        for action in self._in_order():
+            end, hold = action.start, not release
+            if isinstance(action, NamedAction):
+                hold = action.hold
                 with suppress(InputError):  # it may be possible with the predicted chain
-                    done.append(one.action(self._seen(one.start), done))
+                    done.append(action.action(self._seen(action.start), done))
                     end = done[-1].end
             else:
-                done.append(one)
-                end = one.end
-            timed.append(Timed(one, end, hold))
+                done.append(action)
+                end = action.end
+            timed.append(TimedAction(action, end, hold))
         goals = sorted(self.goals, key=lambda goal: goal.time)
-        found = in_steps(self.name, self.initial, timed, [(goal.time, goal.held_by) for goal in goals])
-        return found if self.velocity is None else replace(found, remarks=(
-            *found.remarks, f'trial {self.name!r}: the DLO begins at rest, not with the given velocity'))
+        manipulation = manipulation_of(self.name, self.initial, timed,
+                                       [(goal.time, goal.held_by) for goal in goals])
+        if self.velocity is None:
+            return manipulation
+        warning = f'trial {self.name!r}: the DLO begins at rest, not with the given velocity'
+        return replace(manipulation, warnings=(*manipulation.warnings, warning))
 
     def _in_order(self) -> list[Union[NamedAction, Action]]:
         return sorted(self.actions, key=lambda action: action.start)
@@ -197,23 +192,23 @@ class Request:
     @cached_property
     def document(self) -> bytes:
         """The request as an XML document in UTF-8."""
-        root = new_root('calibration_request')
+        root = xml.new_root('calibration_request', version=1)
         settings = {name: value for name, value in self.options.items() if name != 'mass'}
-        add(root, 'object', name=self.name, mass=self.options.get('mass'))
-        add_options(root, 'settings', settings)
+        xml.add(root, 'object', name=self.name, mass=self.options.get('mass'))
+        xml.add_options(root, 'settings', settings)
         for trial in self.trials:
-            element = add(root, 'trial', name=trial.name)
-            add_chain(element, 'initial_chain', trial.initial)
+            element = xml.add(root, 'trial', name=trial.name)
+            xml.add_points(xml.add(element, 'initial_chain'), trial.initial)
             if trial.velocity is not None:
-                velocity = add(element, 'velocity')
+                velocity = xml.add(element, 'velocity')
                 for x, y, z in trial.velocity.tolist():
-                    add(velocity, 'vector', x=x, y=y, z=z)
+                    xml.add(velocity, 'vector', x=x, y=y, z=z)
             for action in trial.actions:
                 _add_action(element, action)
             for goal in trial.goals:
-                add_chain(element, 'goal_chain', goal.chain, time=goal.time, stable=goal.stable,
-                          held_by=goal.held_by)
-        return document(root)
+                xml.add_points(xml.add(element, 'goal_chain', time=goal.time, stable=goal.stable,
+                               held_by=goal.held_by), goal.chain)
+        return xml.document(root)
 
 
 def write_request(path: str | Path, request: Request) -> None:
@@ -222,7 +217,7 @@ def write_request(path: str | Path, request: Request) -> None:
 
     :raises InputError: where the file cannot be written.
     """
-    write_octets(path, request.document)
+    write_file(path, request.document)
 
 
 def read_request(path: str | Path) -> Request:
@@ -232,7 +227,8 @@ def read_request(path: str | Path) -> Request:
     :raises InputError: where the file cannot be read, or is not a valid request;
         the text names the line and the element.
     """
-    return request_of(read_octets(path, WHAT, 'a calibration request'), f'{WHAT} {path}', Path(path).parent)
+    octets = xml.read_octets(path, WHAT, 'a calibration request')
+    return request_of(octets, f'{WHAT} {path}', Path(path).parent)
 
 
 def request_of(octets: bytes, where: str = WHAT, folder: Path | None = None) -> Request:
@@ -243,23 +239,20 @@ def request_of(octets: bytes, where: str = WHAT, folder: Path | None = None) -> 
     :param folder: of the document, in which its scene may lie.
     :raises InputError: where it is not a valid request.
     """
-    root = parse(octets, where, 'calibration_request')
+    root = xml.parse(octets, where, 'calibration_request')
     of_object, settings, *trials = root
-    given = read_options(where, settings, folder)
+    given = xml.read_options(where, settings, folder)
     options = dict(given.values)
     if 'mass' in options:
-        raise refused(where, settings, "an option 'mass'", 'the mass as an attribute of <object>', 'move it')
+        raise xml.refused(where, settings, "an option 'mass'", 'the mass as an attribute of <object>',
+                          'move it')
     if of_object.get('mass') is not None:
-        options['mass'] = number(where, of_object, 'mass')
-        try:
+        options['mass'] = xml.number(where, of_object, 'mass')
+        with xml.located(where, of_object):
             Options.of({'mass': options['mass']})
-        except InputError as error:
-            raise refused(where, of_object, f'mass {error.came}', error.expected, error.remedy) from error
-    try:
+    with xml.located(where, settings):
         return Request(tuple(_trial(where, trial) for trial in trials), options, of_object.get('name'),
                        given.problems, given.refusal)
-    except InputError as error:
-        raise _placed(where, settings, error) from error
 
 
 def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...], tuple[str, ...]]:
@@ -269,13 +262,13 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
     :param options: `length_tolerance`, `release` and `frame_pose` are used.
     """
     trials, refusals, pose = [], [], options.pose
-    for one in request.trials:
-        if not one.goals:
+    for requested in request.trials:
+        if not requested.goals:
             refusals.append(str(InputError(
-                f'trial {one.name!r}', 'no goal chain', 'at least one',
+                f'trial {requested.name!r}', 'no goal chain', 'at least one',
                 'observe the DLO after the action, or predict it with dlo-calibration simulate')))
             continue
-        trial = (one if pose is None else one.moved(pose)).trial(options.release)
+        trial = (requested if pose is None else requested.moved(pose)).trial(options.release)
         change = max(length_change(trial.initial, goal.chain) for goal in trial.goals)
         if change > options.length_tolerance:
             refusals.append(str(InputError(
@@ -289,75 +282,55 @@ def request_trials(request: Request, options: Options) -> tuple[tuple[Trial, ...
 
 def request_manipulations(request: Request, options: Options) -> tuple[Manipulation, ...]:
     """
-    Return what the hands do in each trial of a request, with or without goal chains.
+    Return the manipulation of each trial of a request, with or without goal chains.
 
     :param options: `release` and `frame_pose` are used.
     """
     pose = options.pose
-    return tuple((one if pose is None else one.moved(pose)).manipulation(options.release)
-                 for one in request.trials)
-
-
-def _hand_names(action: Union[NamedAction, Action]) -> tuple[str, ...]:
-    if isinstance(action, NamedAction):
-        return action.hand_names
-    return tuple(hand.name for hand in action.hands)
+    return tuple((requested if pose is None else requested.moved(pose)).manipulation(options.release)
+                 for requested in request.trials)
 
 
 def _add_action(parent: Any, action: Union[NamedAction, Action]) -> None:
     if isinstance(action, NamedAction):
-        values = {one.name: getattr(action, one.name) for one in fields(action)}
+        values = {part.name: getattr(action, part.name) for part in fields(action)}
         last = {name: values.pop(name) for name in ('start', 'hold')}  # their place in the schema
-        add(parent, action.name, **values, **last)
+        xml.add(parent, action.name, **values, **last)
         return
-    paths = add(parent, PATHS)
+    paths = xml.add(parent, PATHS)
     for hand in action.hands:
-        element = add(paths, 'hand', name=hand.name, grips=hand.grips, offset=hand.offset or None)
+        element = xml.add(paths, 'hand', name=hand.name, grips=hand.grips, offset=hand.offset or None)
         turns = (hand.orientations != NO_ROTATION).any(axis=1)
         for time, (x, y, z), turn, turned in zip(hand.times.tolist(), hand.positions.tolist(),
                                                  hand.orientations.tolist(), turns, strict=True):
-            add(element, 'waypoint', time=time, x=x, y=y, z=z,
+            xml.add(element, 'waypoint', time=time, x=x, y=y, z=z,
                 **(dict(zip(TURNS, turn, strict=True)) if turned else {}))
 
 
-def _placed(where: str, element: Any, error: InputError) -> InputError:
-    """Return an error that names its place in the file."""
-    if error.thing.startswith(where):
-        return error
-    return refused(where, element, f'{error.thing}: {error.came}', error.expected, error.remedy)
-
-
 def _trial(where: str, element: Any) -> TrialRequest:
-    goals = tuple(_goal(where, one) for one in element.findall('goal_chain'))
+    goals = tuple(_goal(where, goal) for goal in element.findall('goal_chain'))
     velocity = element.find('velocity')
-    actions = tuple(_action(where, one) for one in element if one.tag == PATHS or one.tag in NAMED_ACTIONS)
-    initial = read_chain(where, element.find('initial_chain'))
-    try:
+    actions = tuple(_action(where, child) for child in element
+                    if child.tag == PATHS or child.tag in NAMED_ACTIONS)
+    initial = xml.read_chain(where, element.find('initial_chain'))
+    with xml.located(where, element):
         return TrialRequest(element.get('name'), initial, actions, goals,
-                            None if velocity is None else read_vectors(where, velocity))
-    except InputError as error:
-        raise _placed(where, element, error) from error
+                            None if velocity is None else xml.read_vectors(where, velocity))
 
 
 def _goal(where: str, element: Any) -> GoalRequest:
-    held_by = element.get('held_by')
-    time = number(where, element, 'time')
-    if abs(time) > MAXIMUM_TIME:
-        raise refused(where, element, f'a time of {time:g} s', f'at most {MAXIMUM_TIME:g} s')
-    return GoalRequest(read_chain(where, element), time,
-                       element.get('stable', 'true') == 'true',
-                       None if held_by is None else tuple(held_by.split()))
+    goal = GoalRequest(xml.read_chain(where, element), **xml.attributes(where, element, GoalRequest))
+    if abs(goal.time) > MAXIMUM_TIME:
+        raise xml.refused(where, element, f'a time of {goal.time:g} s', f'at most {MAXIMUM_TIME:g} s')
+    return goal
 
 
 def _action(where: str, element: Any) -> Union[NamedAction, Action]:
-    try:
+    with xml.located(where, element):
         if element.tag == PATHS:
             return Action(tuple(_hand(where, hand) for hand in element))
         kind = NAMED_ACTIONS[element.tag]
-        types = {one.name: str(one.type) for one in fields(kind)}
-        return kind(**{name: _value(where, element, name, types[name]) for name in element.attrib})
-    except InputError as error:
-        raise _placed(where, element, error) from error
+        return kind(**xml.attributes(where, element, kind))
 
 
 def _hand(where: str, element: Any) -> Hand:
@@ -365,30 +338,9 @@ def _hand(where: str, element: Any) -> Hand:
     for waypoint in element:
         given = [name for name in TURNS if waypoint.get(name) is not None]
         if given and len(given) < len(TURNS):
-            raise refused(where, waypoint, f'only {" ".join(given)}', 'all of qx qy qz qw, or none')
-        turns.append([number(where, waypoint, name) for name in TURNS] if given else NO_ROTATION)
-    try:
-        return Hand(element.get('name'), tuple(int(one) for one in element.get('grips').split()),
-                    np.array([number(where, waypoint, 'time') for waypoint in element]),
-                    read_vectors(where, element), np.array(turns, dtype=float),
-                    finite(where, element, 'offset', element.get('offset', '0')))
-    except InputError as error:
-        raise _placed(where, element, error) from error
-
-
-def _value(where: str, element: Any, name: str, kind: str) -> Any:
-    """Return an attribute of a named action in `kind`, the type of its field in the dataclass."""
-    text = element.get(name)
-    if kind == 'bool':
-        return text == 'true'
-    if kind == 'str':
-        return text
-    if kind.startswith('int'):
-        return int(text)
-    if kind.startswith('tuple[str'):
-        return tuple(text.split())
-    if kind.startswith('tuple[int'):
-        return tuple(int(one) for one in text.split())
-    if kind.startswith('Numbers'):
-        return tuple(finite(where, element, name, one) for one in text.split())
-    return finite(where, element, name, text)
+            raise xml.refused(where, waypoint, f'only {" ".join(given)}', 'all of qx qy qz qw, or none')
+        turns.append([xml.number(where, waypoint, name) for name in TURNS] if given else NO_ROTATION)
+    with xml.located(where, element):
+        return Hand(times=np.array([xml.number(where, waypoint, 'time') for waypoint in element]),
+                    positions=xml.read_vectors(where, element), orientations=np.array(turns, dtype=float),
+                    **xml.attributes(where, element, Hand))

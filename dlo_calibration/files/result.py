@@ -10,37 +10,24 @@ mass, and the calibration that found them.  The node publishes it, and result.xm
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+import csv
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 import math
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Mapping, Sequence
 
-from dlo_calibration.calibration.automatic import DECIDED
-from dlo_calibration.calibration.file_options import FileOptions
-from dlo_calibration.calibration.plain import plain
-from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
+from dlo_calibration.calibration.choice import DECIDED
+from dlo_calibration.calibration.options import FileOptions
+from dlo_calibration.calibration.result import CalibrationResult, evaluation_rows, ParameterEstimate, plain
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.xml import (
-    add,
-    add_chain,
-    add_options,
-    document,
-    new_root,
-    number,
-    parse,
-    read_chain,
-    read_octets,
-    read_options,
-    refused,
-    text_of,
-    write_octets,
-)
-from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.files import xml
+from dlo_calibration.inference.examination import Confirmation
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace, SCALE
 from dlo_calibration.model.score import PointErrors
+from dlo_calibration.writing import whole, write_file
 
 WHAT = 'result file'  # in errors
 #: Attributes of the calibration, in the order of the document.
@@ -101,7 +88,7 @@ class Description:
     @classmethod
     def of(cls, result: CalibrationResult, options: Mapping[str, Any] | None = None) -> Description:
         """Return the definition of the DLO that a calibration found."""
-        space, told = result.space, plain(result)
+        space, values = result.space, plain(result)
         fixed = {p.name: space.fixed.get(p.name, p.default) for p in space.parameters
                  if p.name not in result.parameters and (p.name != 'mass' or 'mass' in space.fixed)}
         decided = result.choice.options.flat() if result.choice else {}
@@ -112,7 +99,7 @@ class Description:
             errors=result.errors, correlations=result.correlations,
             options={name: decided.get(name, value) if name in DECIDED else value
                      for name, value in (options or {}).items()},
-            warnings=result.warnings, confirmation=result.confirmation, **{key: told[key] for key in HOW})
+            warnings=result.warnings, confirmation=result.confirmation, **{key: values[key] for key in HOW})
 
     @property
     def file_options(self) -> FileOptions:
@@ -134,37 +121,36 @@ class Description:
         return self.space.physical(self.values, self.length)
 
 
-def description_document(found: CalibrationResult | Description,
+def description_document(result: CalibrationResult | Description,
                          options: Mapping[str, Any] | None = None) -> bytes:
     """Return the definition of a DLO as an XML document in UTF-8."""
-    dlo = found if isinstance(found, Description) else Description.of(found, options)
+    dlo = result if isinstance(result, Description) else Description.of(result, options)
     space = dlo.space
-    root = new_root('dlo')
-    root.set('mass', text_of(dlo.mass))
-    root.set('length', text_of(dlo.length))
-    add_chain(root, 'chain', dlo.chain)
-    parameters = add(root, 'parameters')
+    root = xml.new_root('dlo', version=1, mass=dlo.mass, length=dlo.length)
+    xml.add_points(xml.add(root, 'chain'), dlo.chain)
+    parameters = xml.add(root, 'parameters')
     for estimate in dlo.parameters.values():
         words = {name: getattr(estimate, name) or None for name in ('verdict', 'note')}  # None is left out
-        add(parameters, 'found', **{**asdict(estimate), **words})
+        xml.add(parameters, 'found', **{**asdict(estimate), **words})
     for name, value in dlo.fixed.items():
         physical, unit = space.reported(name, value)
-        add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)
+        xml.add(parameters, 'fixed', name=name, value=value, physical_value=physical, physical_unit=unit)
     if dlo.correlations is not None:
-        correlations = add(parameters, 'correlations')
-        for one, other in combinations(dlo.parameters, 2):
-            add(correlations, 'correlation', first=one, second=other, value=dlo.correlations[one][other])
+        correlations = xml.add(parameters, 'correlations')
+        for first, second in combinations(dlo.parameters, 2):
+            xml.add(correlations, 'correlation', first=first, second=second,
+                value=dlo.correlations[first][second])
     how = {key: getattr(dlo, key) for key in HOW}
-    calibration = add(root, 'calibration', **{key: 'none' if one is None else one
-                                              for key, one in how.items()})
+    calibration = xml.add(root, 'calibration', **{key: 'none' if value is None else value
+                                              for key, value in how.items()})
     _add_fit(calibration, 'fit', dlo, dlo.trials)
     if dlo.confirmation is not None:
         _add_fit(calibration, 'confirmation', dlo.confirmation, dlo.trials)
-    add_options(calibration, 'options', dlo.options)
-    warnings = add(calibration, 'warnings')
+    xml.add_options(calibration, 'options', dlo.options)
+    warnings = xml.add(calibration, 'warnings')
     for text in dlo.warnings:
-        add(warnings, 'warning', text=text)
-    return document(root)
+        xml.add(warnings, 'warning', text=text)
+    return xml.document(root)
 
 
 def write_result(path: str | Path, result: CalibrationResult | Description,
@@ -174,7 +160,18 @@ def write_result(path: str | Path, result: CalibrationResult | Description,
 
     :raises InputError: where the file cannot be written.
     """
-    write_octets(path, description_document(result, options))
+    write_file(path, description_document(result, options))
+
+
+def write_evaluations(path: Path, result: CalibrationResult) -> None:
+    """
+    Write every evaluation as a row of a CSV file; see `evaluation_rows`.
+
+    :raises InputError: where the file cannot be written.
+    """
+    head, rows = evaluation_rows(result)
+    with whole(path) as new, new.open('w', newline='', encoding='utf-8') as stream:
+        csv.writer(stream).writerows([head, *rows])
 
 
 def read_result(path: str | Path) -> Description:
@@ -184,7 +181,7 @@ def read_result(path: str | Path) -> Description:
     :raises InputError: where the file cannot be read, or is not a valid result;
         the text names the line and the element.
     """
-    return read_description(read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}', Path(path).parent)
+    return read_description(xml.read_octets(path, WHAT, 'a result.xml'), f'{WHAT} {path}', Path(path).parent)
 
 
 def read_description(octets: bytes | str, where: str = 'dlo_description',
@@ -198,78 +195,56 @@ def read_description(octets: bytes | str, where: str = 'dlo_description',
     """
     if isinstance(octets, str):
         octets = octets.encode('utf-8', 'surrogatepass')
-    root = parse(octets, where, 'dlo')
+    root = xml.parse(octets, where, 'dlo')
     chain, parameters, calibration = root
     fit, *second, options, warnings = calibration
-    given = read_options(where, options, folder)
-    seed, unusable = calibration.get('seed'), calibration.get('unusable', '')
-    try:
+    given = xml.read_options(where, options, folder)
+    unusable = calibration.get('unusable')
+    with xml.located(where, parameters):
         dlo = Description(
-            parameters=_estimates(where, parameters), fixed=_fixed(where, parameters),
-            mass=number(where, root, 'mass'), length=number(where, root, 'length'),
-            chain=read_chain(where, chain), score=number(where, fit, 'score'),
-            trials=tuple(trial.get('name') for trial in fit),
-            scores=tuple(number(where, trial, 'score') for trial in fit),
-            errors=_errors(where, fit),
-            search=calibration.get('search'), engine=calibration.get('engine'),
-            seed=None if seed == 'none' else int(seed), evaluations=int(calibration.get('evaluations')),
-            simulations=int(calibration.get('simulations')), seconds=number(where, calibration, 'seconds'),
-            stop_reason=calibration.get('stop_reason'), correlations=_correlations(where, parameters),
-            options=given.values, choice=calibration.get('choice', ''), unusable=unusable,
+            **xml.attributes(where, root, Description), **xml.attributes(where, calibration, Description),
+            **_fit(where, fit, Description), parameters=_estimates(where, parameters),
+            fixed=_fixed(where, parameters), correlations=_correlations(where, parameters),
+            chain=xml.read_chain(where, chain), trials=tuple(trial.get('name') for trial in fit),
+            options=given.values, refusal=given.refusal,
             problems=(*([f'do not use this result: {unusable}'] if unusable else []), *given.problems),
-            refusal=given.refusal,
             warnings=tuple(warning.get('text') for warning in warnings),
-            confirmation=_confirmation(where, second[0]) if second else None)
+            confirmation=Confirmation(**_fit(where, second[0], Confirmation)) if second else None)
         space = dlo.space
-    except InputError as error:
-        if error.thing.startswith(where):
-            raise
-        raise refused(where, parameters, f'{error.thing}: {error.came}', error.expected,
-                      error.remedy) from error
     if not dlo.mass >= 0 or not dlo.length > 0:
-        raise refused(where, root, f'mass {dlo.mass:g} kg, length {dlo.length:g} m',
+        raise xml.refused(where, root, f'mass {dlo.mass:g} kg, length {dlo.length:g} m',
                       'a mass of 0 or more, a length above 0', 'correct them')
     for element in parameters.findall('fixed'):
         _check_physical(where, element, space)
     return dlo
 
 
-def _add_fit(calibration: Any, tag: str, found: Description | Confirmation, trials: Sequence[str]) -> None:
+def _add_fit(calibration: Any, tag: str, fit: Description | Confirmation, trials: Sequence[str]) -> None:
     """Add the score and errors of all trials, and the score of each, by the first or a second engine."""
-    other = vars(found) if isinstance(found, Confirmation) else {}
-    element = add(calibration, tag, engine=other.get('engine'), score=found.score, **asdict(found.errors),
+    other = vars(fit) if isinstance(fit, Confirmation) else {}
+    element = xml.add(calibration, tag, engine=other.get('engine'), score=fit.score, **asdict(fit.errors),
                   mean_distance=other.get('mean_distance'), max_distance=other.get('max_distance'))
-    for name, score in zip(trials, found.scores, strict=True):
-        add(element, 'trial', name=name, score=score)
+    for name, score in zip(trials, fit.scores, strict=True):
+        xml.add(element, 'trial', name=name, score=score)
 
 
-def _confirmation(where: str, element: Any) -> Confirmation:
-    return Confirmation(
-        engine=element.get('engine'), score=number(where, element, 'score'),
-        scores=tuple(number(where, trial, 'score') for trial in element), errors=_errors(where, element),
-        mean_distance=number(where, element, 'mean_distance'),
-        max_distance=number(where, element, 'max_distance'))
-
-
-def _errors(where: str, element: Any) -> PointErrors:
-    return PointErrors(**{one.name: number(where, element, one.name) for one in fields(PointErrors)})
+def _fit(where: str, element: Any, record: type[Description | Confirmation]) -> dict[str, Any]:
+    """Return what `_add_fit` wrote, as the fields of a record."""
+    return {**xml.attributes(where, element, record),
+            'scores': tuple(xml.number(where, trial, 'score') for trial in element),
+            'errors': PointErrors(**xml.attributes(where, element, PointErrors))}
 
 
 def _estimates(where: str, parameters: Any) -> dict[str, ParameterEstimate]:
-    found: dict[str, ParameterEstimate] = {}
+    estimates: dict[str, ParameterEstimate] = {}
     for element in parameters.findall('found'):
-        name = element.get('name')
-        numbers = {one: number(where, element, one) for one in (
-            'value', 'std', 'lower', 'upper', 'physical_value', 'physical_lower', 'physical_upper')}
-        if name in found:
-            raise refused(where, element, f'the name {name!r} twice', 'each name once')
-        if not 0 <= numbers['value'] <= SCALE:
-            raise refused(where, element, f'value {numbers["value"]:g}', '0 to 100')
-        found[name] = ParameterEstimate(
-            name, **numbers, physical_unit=element.get('physical_unit'),
-            identifiable=element.get('identifiable') == 'true', verdict=element.get('verdict', ''),
-            note=element.get('note', ''))
-    return found
+        estimate = ParameterEstimate(**xml.attributes(where, element, ParameterEstimate))
+        if estimate.name in estimates:
+            raise xml.refused(where, element, f'the name {estimate.name!r} twice', 'each name once')
+        if not 0 <= estimate.value <= SCALE:
+            raise xml.refused(where, element, f'value {estimate.value:g}', '0 to 100')
+        estimates[estimate.name] = estimate
+    return estimates
 
 
 def _fixed(where: str, parameters: Any) -> dict[str, float]:
@@ -278,11 +253,11 @@ def _fixed(where: str, parameters: Any) -> dict[str, float]:
     for element in parameters.findall('fixed'):
         name = element.get('name')
         if name in names:
-            raise refused(where, element, f'the name {name!r} twice', 'each name once, found or fixed')
+            raise xml.refused(where, element, f'the name {name!r} twice', 'each name once, found or fixed')
         names.add(name)
-        fixed[name] = number(where, element, 'value')
+        fixed[name] = xml.number(where, element, 'value')
         if not 0 <= fixed[name] <= SCALE:
-            raise refused(where, element, f'value {fixed[name]:g}', '0 to 100')
+            raise xml.refused(where, element, f'value {fixed[name]:g}', '0 to 100')
     return fixed
 
 
@@ -290,28 +265,29 @@ def _correlations(where: str, parameters: Any) -> dict[str, dict[str, float]] | 
     element = parameters.find('correlations')
     if element is None:
         return None
-    names = [found.get('name') for found in parameters.findall('found')]
-    found = {name: {name: 1.0} for name in names}
-    for one in element:
-        pair, value = (one.get('first'), one.get('second')), number(where, one, 'value')
-        if pair[0] == pair[1] or not found.keys() >= set(pair):
-            raise refused(where, one, f'the pair {pair[0]!r}, {pair[1]!r}', 'two found parameters')
-        if pair[1] in found[pair[0]]:
-            raise refused(where, one, f'the pair {pair[0]!r}, {pair[1]!r} twice', 'each pair once')
+    names = [estimate.get('name') for estimate in parameters.findall('found')]
+    correlations = {name: {name: 1.0} for name in names}
+    for correlation in element:
+        first, second = correlation.get('first'), correlation.get('second')
+        value = xml.number(where, correlation, 'value')
+        if first == second or not correlations.keys() >= {first, second}:
+            raise xml.refused(where, correlation, f'the pair {first!r}, {second!r}', 'two found parameters')
+        if second in correlations[first]:
+            raise xml.refused(where, correlation, f'the pair {first!r}, {second!r} twice', 'each pair once')
         if not -1 <= value <= 1:
-            raise refused(where, one, f'value {value:g}', '-1 to 1')
-        found[pair[0]][pair[1]] = found[pair[1]][pair[0]] = value
+            raise xml.refused(where, correlation, f'value {value:g}', '-1 to 1')
+        correlations[first][second] = correlations[second][first] = value
     pairs = len(names) * (len(names) - 1) // 2
     if len(element) != pairs:
-        raise refused(where, element, f'{len(element)} correlations', f'{pairs}, one for each pair',
+        raise xml.refused(where, element, f'{len(element)} correlations', f'{pairs}, one for each pair',
                       'add the others, or leave all out')
-    return found
+    return correlations
 
 
 def _check_physical(where: str, element: Any, space: ParameterSpace) -> None:
     """Refuse a value and a physical value that differ by more than rounding."""
-    physical, unit = space.reported(element.get('name'), number(where, element, 'value'))
-    given = number(where, element, 'physical_value')
+    physical, unit = space.reported(element.get('name'), xml.number(where, element, 'value'))
+    given = xml.number(where, element, 'physical_value')
     if not math.isclose(given, physical, rel_tol=1e-3) or element.get('physical_unit') != unit:
-        raise refused(where, element, f'{given:g} {element.get("physical_unit")} for the value '
+        raise xml.refused(where, element, f'{given:g} {element.get("physical_unit")} for the value '
                       f'{element.get("value")}', f'{physical:g} {unit}', 'change both')

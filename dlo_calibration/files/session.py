@@ -13,17 +13,17 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+import os
 from pathlib import Path
-from typing import Any, Iterable, Mapping, overload, Sequence
+import sys
+from typing import Any, Iterable, Mapping
 
 import numpy as np
 
-from dlo_calibration.calibration.file_options import file_options, FileOptions
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import DEFECT, InputError, meant, one_of, told
-from dlo_calibration.files.bag import Bag, decode, encode
-from dlo_calibration.files.intake import Record
-from dlo_calibration.files.taken_back import without_taken_back
+from dlo_calibration.calibration.options import file_options, FileOptions, Options
+from dlo_calibration.errors import DEFECT, InputError, one_of, safe_line, suggestion
+from dlo_calibration.files.bag_reader import read_bag
+from dlo_calibration.files.record import decode, encode, Record
 from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
@@ -31,53 +31,15 @@ from dlo_calibration.messages.codec import (
     chain_cloud,
     GOAL,
     INPUT_TYPES,
+    Key,
+    Message,
     read,
 )
-from dlo_calibration.messages.collector import TrialCollector
+from dlo_calibration.messages.collector import StampOrder, TrialCollector, went_back
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.messages.refusals import counted
-from dlo_calibration.messages.stamp_order import StampOrder, went_back
-from dlo_calibration.messages.trial_builder import Key, Message
-from dlo_calibration.messages.trial_builder import order as order_of
-from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.model.named_actions import Manipulation
 from dlo_calibration.model.trial import Trial
-
-
-class Messages(Sequence[tuple[str, Any]]):
-    """
-    The (kind, message) pairs of records that decode; each is decoded anew where it is used.
-
-    A decoded message takes several times the memory of its bytes.
-    """
-
-    def __init__(self, records: Sequence[Record] = ()) -> None:
-        self._records = tuple(records)
-
-    @property
-    def renamed(self) -> tuple[Record, ...]:
-        """The records, those of remapped topics under names that need no remapping."""
-        home = next((one.namespace for one in self._records if not one.stands_for), '/calibrator')
-        return tuple(replace(one, topic=f'{home}/{one.name}', stands_for='') for one in self._records)
-
-    @property
-    def remapped(self) -> bool:
-        """Whether topics are read as others."""
-        return any(one.stands_for for one in self._records)
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    @overload
-    def __getitem__(self, index: int) -> tuple[str, Any]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Messages: ...
-
-    def __getitem__(self, index: int | slice) -> tuple[str, Any] | Messages:
-        if isinstance(index, slice):
-            return Messages(self._records[index])
-        record = self._records[index]
-        return record.name, decode(record)
 
 
 @dataclass(frozen=True)
@@ -85,21 +47,20 @@ class Session:
     """
     The content of a recorded session.
 
-    :param messages: (kind, message) pairs of the input topics in log order: those that
-        the last calibration of the session used, or, where none was started, all since
-        the last reset.
+    :param inputs: messages of the input topics that decode, in log order: those that the last calibration
+        of the session used, or, where none was started, all since the last reset.
     :param records: all recorded messages of the calibrator's topics, also outputs, in log order.
     :param recorded: the last recorded options, by name, as far as a file may set them; None: there were none.
     :param problems: one text for each defect that did not prevent reading.
     :param refusal: why the recorded scene is not among the options.
     :param counts: number of recorded messages by topic, also of those that other programs use.
     :param duration: time from the first to the last of these [s].
-    :param frames: the frame_ids of `messages`, sorted.
+    :param frames: the frame_ids of `inputs`, sorted.
     :param others: topics that are neither inputs nor outputs of the calibrator, and their types.
     """
 
     path: Path
-    messages: Messages
+    inputs: tuple[Record, ...]
     records: tuple[Record, ...]
     recorded: dict[str, Any] | None = None
     problems: tuple[str, ...] = ()
@@ -108,6 +69,23 @@ class Session:
     duration: float = 0.0
     frames: tuple[str, ...] = ()
     others: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def messages(self) -> list[tuple[str, Any]]:
+        """The (kind, message) pairs of `inputs`, which take several times the memory of their records."""
+        return [(record.name, decode(record)) for record in self.inputs]
+
+    @property
+    def remapped(self) -> bool:
+        """Whether topics are read as others."""
+        return any(record.stands_for for record in self.inputs)
+
+    @property
+    def renamed(self) -> tuple[Record, ...]:
+        """The inputs, those of remapped topics under names that need no remapping."""
+        home = next((record.namespace for record in self.inputs if not record.stands_for), '/calibrator')
+        return tuple(replace(record, topic=f'{home}/{record.name}', stands_for='')
+                     for record in self.inputs)
 
     @property
     def options(self) -> Options:
@@ -158,17 +136,18 @@ def session_trials(session: Session, options: Options) -> tuple[tuple[Trial, ...
 
 def session_manipulations(session: Session,
                           options: Options) -> tuple[tuple[Manipulation, ...], tuple[str, ...]]:
-    """Return what the hands did in a session, with or without goal chains, and why messages are not used."""
+    """Return the manipulations of a session, with or without goal chains, and why messages are not used."""
     clocks, refusals = _by_clock(session)
-    found: list[Manipulation] = []
+    manipulations: list[Manipulation] = []
     for messages in clocks:
         collector, refused = _collected(messages, options)
-        some, problems = collector.manipulations()
-        found += some
+        of_clock, problems = collector.manipulations()
+        manipulations += of_clock
         judged = {str(problem) for problem in collector.problems}  # `problems` has those that hold here
         refusals += [text for kind, text in refused if kind != GOAL and text not in judged]
         refusals += map(str, problems)
-    named = (replace(one, name=f'trial {k}') for k, one in enumerate(found, start=1))
+    named = (replace(manipulation, name=f'trial {k}')
+             for k, manipulation in enumerate(manipulations, start=1))
     return tuple(named), counted(refusals)
 
 
@@ -176,55 +155,55 @@ def _by_clock(session: Session) -> tuple[list[list[Message]], list[str]]:
     """Return the messages before and after each jump of the clock, and why others are not used."""
     order, refusals = StampOrder(), []
     clocks: list[list[Message]] = [[]]
-    for kind, message in session.messages:
+    for record in session.inputs:
         try:
-            one = read(kind, message)
-            order.check(one)
+            content = read(record.name, decode(record))
+            order.check(content)
         except InputError as error:
             refusals.append(str(error))
             continue
         except Exception as error:  # a defect of this package must not cost the other messages
-            refusals.append(f'{kind}: could not be used ({error!r}); {DEFECT}')
+            refusals.append(f'{record.name}: could not be used ({error!r}); {DEFECT}')
             continue
-        if order.clock_went_back(one):
-            refusals.append(f'{went_back(order.newest, one.stamp)}: '
+        if order.clock_went_back(content):
+            refusals.append(f'{went_back(order.newest, content.stamp)}: '
                             'what comes after it makes trials of its own')
-            order = order.after_jump()
+            order = StampOrder(order)
             clocks.append([])
-        order.add(one)
-        clocks[-1].append(one)
+        order.add(content)
+        clocks[-1].append(content)
     known: dict[Key, Message] = {}
     for k, messages in enumerate(clocks):
-        fresh = [one for one in messages
-                 if order_of(one) not in known or not _same(one, known[order_of(one)])]
+        fresh = [message for message in messages
+                 if message.key not in known or not _same(message, known[message.key])]
         if len(fresh) < len(messages):
             refusals.append(f'{len(messages) - len(fresh)} message(s) after the clock went back repeat '
                             'earlier ones: a recording that was played again is no second observation')
-        known |= {order_of(one): one for one in messages}
+        known |= {message.key: message for message in messages}
         clocks[k] = fresh
     return clocks, refusals
 
 
 def _collected(messages: Iterable[Message],
                options: Options) -> tuple[TrialCollector, list[tuple[str, str]]]:
-    """Collect messages with stamps of one clock; also return the kinds of those refused, and why."""
+    """Collect messages with stamps of message clock; also return the kinds of those refused, and why."""
     collector = TrialCollector(options)
     refusals = []
     # The trials do not depend on the order of arrival.
-    for one in sorted(messages, key=lambda one: one.stamp):
+    for message in sorted(messages, key=lambda message: message.stamp):
         try:
-            collector.add(one)
+            collector.add(message)
         except InputError as error:
-            refusals.append((one.kind, str(error)))
+            refusals.append((message.kind, str(error)))
         except Exception as error:  # a defect of this package must not cost the other messages
-            refusals.append((one.kind, f'{one}: could not be used ({error!r}); {DEFECT}'))
-        refusals += [(one.kind, str(refusal))
-                     for refusal in (*collector.take_news(), *collector.take_early())]
+            refusals.append((message.kind, f'{message}: could not be used ({error!r}); {DEFECT}'))
+        refusals += [(message.kind, str(refusal))
+                     for refusal in (*collector.take_refusals(), *collector.take_early())]
     return collector, refusals
 
 
 def _same(one: Message, other: Message) -> bool:
-    """Tell whether two messages of one kind and stamp have the same content."""
+    """Return whether two messages of one kind and stamp have the same content."""
     a, b = (message.positions if isinstance(message, ActionMessage) else message.chain.observed
             for message in (one, other))
     return bool(np.array_equal(a, b, equal_nan=True))
@@ -235,7 +214,7 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     """
     Read an MCAP file, a rosbag2 folder, or a .db3 file.
 
-    Input topics are recognised by the last component of their name and by their type.
+    Input topics are recognised by the last part of their name and by their type.
 
     :param namespace: of the input topics, e.g. ``/calibrator``; needed where several namespaces have them.
     :param remap: topics with other names, and as which input each is read, e.g. ``{'/trackdlo/results_pc':
@@ -244,11 +223,10 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
     :raises InputError: where the session cannot be read, or has none of the input topics.
     """
     path, remap = Path(path), remap or {}
-    source = Bag(path, remap)
-    source.read()
-    records = tuple(sorted(source.records, key=lambda record: record.log_time))
-    recorded, problems = source.options(), source.problems
-    seen = sorted(source.intake.counts)
+    bag = read_bag(path, remap)
+    records = tuple(sorted(bag.records, key=lambda record: record.log_time))
+    recorded, problems = bag.options(), bag.problems
+    seen = sorted(bag.counts)
     _check_remap(remap, dict(seen))
     try:
         topics = _input_topics(path, seen, namespace, remap, problems)
@@ -260,25 +238,21 @@ def read_session(path: str | Path, namespace: str | None = None, remap: Mapping[
         problems.append(f'no topic is one of {", ".join(INPUT_TYPES)}; {error.remedy}')
     inputs = [record for record in records
               if record.topic in topics and record.type == INPUT_TYPES[record.name]]
-    used = source.used(inputs)
-    messages, frames = _checked(without_taken_back(used, source.taken_back, problems), problems)
-    problems += source.dropped()
-    late = len(inputs) - len(used)
-    if late:
-        problems.append(f'{late} message(s) before the last reset or after the last start are left out, '
-                        'as the live calibration did not use them')
+    usable, frames = _checked(bag.used(inputs), problems)
+    problems += bag.dropped()
     counts: Counter[str] = Counter()
-    for (topic, _), count in source.intake.counts.items():
+    for (topic, _), count in bag.counts.items():
         counts[topic] += count
     allowed = file_options(recorded or {}, path if path.is_dir() else path.parent)
-    return Session(path, messages, records, None if recorded is None else dict(allowed.values),
-                   counted(map(told, [*problems, *allowed.problems])), allowed.refusal, counts,
-                   source.intake.duration, frames,
-                   {topic: kind for topic, kind in seen if not source.intake.uses(topic, kind)})
+    return Session(path, usable, records, None if recorded is None else dict(allowed.values),
+                   counted(map(safe_line, [*problems, *allowed.problems])), allowed.refusal, counts,
+                   bag.duration, frames,
+                   {topic: kind for topic, kind in seen if not bag.uses(topic, kind)})
 
 
-def _checked(records: Iterable[Record], problems: list[str]) -> tuple[Messages, tuple[str, ...]]:
-    """Return the messages that decode, and their frame_ids; tell of the others, once for each topic."""
+def _checked(records: Iterable[Record],
+             problems: list[str]) -> tuple[tuple[Record, ...], tuple[str, ...]]:
+    """Return the messages that decode, and their frame_ids; report the others, once for each topic."""
     good, frames = [], set()
     bad: dict[str, InputError] = {}
     more: Counter[str] = Counter()
@@ -293,7 +267,7 @@ def _checked(records: Iterable[Record], problems: list[str]) -> tuple[Messages, 
         frames.add(frame)
     problems += [f'{error}; and {more[topic]} more of {topic}' if more[topic] else str(error)
                  for topic, error in bad.items()]
-    return Messages(good), tuple(sorted(frames))
+    return tuple(good), tuple(sorted(frames))
 
 
 def _check_remap(remap: Mapping[str, str], seen: Mapping[str, str]) -> None:
@@ -301,7 +275,8 @@ def _check_remap(remap: Mapping[str, str], seen: Mapping[str, str]) -> None:
     for topic, kind in remap.items():
         if topic not in seen:
             raise InputError(f'topic {topic} to read as {kind}', 'no such topic', one_of(seen, topic),
-                             meant(topic, seen, 'correct the name; dlo-calibration info lists the topics'))
+                             suggestion(topic, seen,
+                                        'correct the name; dlo-calibration info lists the topics'))
         if seen[topic] != INPUT_TYPES[kind]:
             raise InputError(f'topic {topic} to read as {kind}', f'a {seen[topic]}',
                              f'a {INPUT_TYPES[kind]}', 'name another topic; dlo-calibration info lists them')
@@ -310,7 +285,7 @@ def _check_remap(remap: Mapping[str, str], seen: Mapping[str, str]) -> None:
 def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | None,
                   remap: Mapping[str, str], problems: list[str]) -> frozenset[str]:
     """Return the topics to read, at most one for each kind of message; `seen` has topics and their types."""
-    found: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES if kind not in remap.values()}
+    candidates: dict[str, list[Record]] = {kind: [] for kind in INPUT_TYPES if kind not in remap.values()}
     for record in (Record(topic, kind, b'', 0) for topic, kind in seen):
         if record.topic in remap:
             continue
@@ -319,11 +294,11 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
             continue
         if record.type == INPUT_TYPES.get(record.name):
             if namespace is None or record.namespace.strip('/') == namespace.strip('/'):
-                found[record.name].append(record)
+                candidates[record.name].append(record)
         elif record.name in INPUT_TYPES:
             problems.append(f'topic {record.topic} is left out: it is a {record.type}, '
                             f'not a {INPUT_TYPES[record.name]}')
-    if not (remap or any(found.values())):
+    if not (remap or any(candidates.values())):
         held = ', '.join(sorted(f'{topic} ({kind})' for topic, kind in seen)) or 'no messages'
         raise InputError(
             f'session {path}', f'{held} ({problems[-1]})' if problems else held,
@@ -331,15 +306,27 @@ def _input_topics(path: Path, seen: Iterable[tuple[str, str]], namespace: str | 
             + ('' if namespace is None else f' in namespace {namespace}'),
             'record these topics, or name others with --remap TOPIC:=goal_chain' if namespace is None else
             'correct the namespace')
-    if any(len(choice) > 1 for choice in found.values()):
-        spaces = sorted({record.namespace or '/' for choice in found.values() for record in choice})
-        complete = [space for space in spaces
-                    if all(space.rstrip('/') in {r.namespace for r in choice} for choice in found.values())]
+    if any(len(choice) > 1 for choice in candidates.values()):
+        spaces = sorted({record.namespace or '/' for choice in candidates.values() for record in choice})
+        complete = [space for space in spaces if all(
+            space.rstrip('/') in {record.namespace for record in choice} for choice in candidates.values())]
         if len(complete) != 1:
             raise InputError(
                 f'session {path}', f'input topics in the namespaces {", ".join(spaces)}',
                 'one namespace with the three input topics', 'name the namespace to read, or record only one')
         problems.append(f'topics outside the namespace {complete[0]} are left out')
-        found = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
-                 for kind, choice in found.items()}
-    return frozenset([*remap, *(record.topic for choice in found.values() for record in choice)])
+        candidates = {kind: [r for r in choice if r.namespace == complete[0].rstrip('/')]
+                 for kind, choice in candidates.items()}
+    return frozenset([*remap, *(record.topic for choice in candidates.values() for record in choice)])
+
+
+def samples() -> Path:
+    """Return the folder of the sample sessions, in the sources or where the package is installed."""
+    beside = Path(__file__).resolve().parents[2] / 'msg_samples'
+    shared = Path('share') / 'dlo_calibration' / 'msg_samples'
+    prefixes = [sys.prefix, *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
+    for folder in (beside, *(Path(prefix) / shared for prefix in prefixes if prefix)):
+        if folder.is_dir():
+            return folder
+    raise InputError('samples', 'no folder msg_samples', f'{beside} or $AMENT_PREFIX_PATH/{shared}',
+                     'install the package with its samples, or name a session')

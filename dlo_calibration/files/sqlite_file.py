@@ -1,47 +1,70 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""SqliteFile: reads the .db3 files of rosbag2, around damaged pages."""
+"""
+SQLite file: reads the .db3 files of rosbag2, around damaged pages.
+
+SQLite evaluates views, virtual tables and generated columns while it reads, and a single function in them can
+take hours that no signal ends.  So a file that defines more than plain tables and indices is refused.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from contextlib import closing
+from itertools import count
 from pathlib import Path
+import re
 import sqlite3
 from typing import Iterator
 from urllib.parse import quote
 
-from dlo_calibration.files.intake import full_name, Intake, NAME_LENGTH, Record
-from dlo_calibration.files.unpacking import AT_ONCE, unpacked_message
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.bag import AT_ONCE, Bag, full_name, LimitExceeded, NAME_LENGTH, unpacked_message
+from dlo_calibration.files.record import Record
 
+DEFINITION = re.compile(r'CREATE\s+(TABLE|UNIQUE\s+INDEX|INDEX)\b', re.IGNORECASE)
+COMPUTED = re.compile(r'\b(AS|ROWID)\b', re.IGNORECASE)  # in each view and generated column; not in rosbag2's
+DEFINITION_LENGTH = 10_000  # characters of a definition, or of a topic; rosbag2's have a few hundred
+MOST_TOPICS = 10_000
 PAGES = 100  # damaged ones that are gone around; more are hardly a recording
-STEPS = 10**9  # of SQLite's machine for one file: a minute or two; a real recording takes 50 for a message
+STEPS = 10**7  # of SQLite's machine for a file of any size: a second or two
+STEPS_PER_BYTE = 4  # of a larger file: a message takes 50 steps, and 16 bytes at least
+STEPS_AT_ONCE = 10**5  # between two calls of Python, which looks at signals
 
 
-def read_sqlite(path: Path, name: str, intake: Intake) -> None:
+def read_sqlite(path: Path, file: Path, bag: Bag) -> None:
     """
-    Read all messages that can be read; what cannot is described in the problems of the intake.
+    Read all messages that can be read; what cannot is described in the problems of the bag.
 
-    :param name: of the file, for the descriptions of problems.
+    :param file: of the session, which `path` is or was unpacked from; problems and errors name it.
     :raises sqlite3.Error: where it is no database of rosbag2.
+    :raises InputError: where it defines anything to be evaluated.
     :raises LimitExceeded: where more comes out of it than of any real recording.
     """
-    intake.open(path.stat().st_size)
+    size = path.stat().st_size
+    bag.open(size)
+    calls, most = count(), (STEPS + STEPS_PER_BYTE * size) // STEPS_AT_ONCE
     # Immutable: no journal of somebody else is played back, and nothing is written.
-    connection = sqlite3.connect(f'file:{quote(str(path))}?mode=ro&immutable=1', uri=True)
-    try:
-        connection.text_factory = lambda octets: octets[:NAME_LENGTH].decode(errors='replace')
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, AT_ONCE)
-        connection.execute('PRAGMA trusted_schema = OFF')
+    with closing(sqlite3.connect(f'file:{quote(str(path))}?mode=ro&immutable=1', uri=True)) as connection:
+        connection.text_factory = lambda octets: octets.decode(errors='replace')
+        connection.set_progress_handler(lambda: next(calls) > most, STEPS_AT_ONCE)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, DEFINITION_LENGTH)
         if _whole(path):  # SQLite takes the pages that a cut file lacks for zeros then
             connection.execute('PRAGMA writable_schema = ON')  # reads on where an index is damaged
-        connection.set_progress_handler(lambda: 1, STEPS)
-        _read(connection, name, intake)
-    finally:
-        connection.close()
+        try:
+            _require_plain_tables(connection, file)
+            topics = _topics(connection, bag)
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, AT_ONCE)
+            _read_messages(connection, topics, file.name, bag)
+        except sqlite3.OperationalError as error:
+            if next(calls) <= most:
+                raise
+            raise LimitExceeded(f'it takes longer to read than any recording of {size} bytes') from error
 
 
 def _whole(path: Path) -> bool:
-    """Tell whether a file has as many pages as its header says."""
+    """Return whether a file has as many pages as its header says."""
     with path.open('rb') as stream:
         head = stream.read(100)
     if len(head) < 100:
@@ -50,55 +73,65 @@ def _whole(path: Path) -> bool:
     return path.stat().st_size >= (65536 if size == 1 else size) * int.from_bytes(head[28:32], 'big')
 
 
-def _read(connection: sqlite3.Connection, name: str, intake: Intake) -> None:
-    tables = connection.execute(
-        "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0 "
-        "AND name IN ('topics', 'messages')")
-    if len(tables.fetchall()) != 2:  # a view could compute rows without end
-        raise sqlite3.DatabaseError('it has not the tables of rosbag2')
-    topics = {number: (str(topic), full_name(str(kind)), encoding) for number, topic, kind, encoding in
-              connection.execute('SELECT id, name, type, serialization_format FROM topics LIMIT 10000')}
-    others = [(topic, encoding) for topic, _, encoding in topics.values() if encoding != 'cdr']
-    if others:
-        topic, encoding = others[0]
-        more = f', and {len(others) - 1} more topics' if len(others) > 1 else ''
-        intake.problems.append(f'topic {topic} is left out: its messages are {encoding!r}, not cdr{more}')
-    count, pages = 0, 0
-    for row in _rows(connection, [number for number, (topic, kind, encoding) in topics.items()
-                                  if encoding == 'cdr' and intake.uses(topic, kind)]):
-        if row is None:
-            pages += 1
+def _require_plain_tables(connection: sqlite3.Connection, file: Path) -> None:
+    """
+    Refuse a database that defines anything to be evaluated; loading a definition evaluates nothing.
+
+    :raises InputError: where it does.
+    """
+    for definition, in connection.execute("SELECT sql FROM sqlite_master WHERE sql <> ''"):
+        if not DEFINITION.match(definition) or COMPUTED.search(definition):
+            raise InputError(f'recording {file}',
+                             f'a database that may compute its content ({definition[:40]} ...)',
+                             'no more than the tables of rosbag2', 'record it again, or name another file')
+
+
+def _topics(connection: sqlite3.Connection, bag: Bag) -> dict[int, tuple[str, str, bool]]:
+    """Return name, type, and whether the encoding is cdr, of each topic, by its id."""
+    topics = {}
+    for number, topic, kind, encoding in connection.execute(
+            'SELECT id, name, type, serialization_format FROM topics NOT INDEXED LIMIT ?', (MOST_TOPICS,)):
+        topic = str(topic)[:NAME_LENGTH]
+        topics[number] = topic, full_name(str(kind)[:NAME_LENGTH]), encoding == 'cdr'
+        if encoding != 'cdr':
+            bag.leave_out(topic, encoding)
+    return topics
+
+
+def _read_messages(connection: sqlite3.Connection, topics: dict[int, tuple[str, str, bool]], name: str,
+                   bag: Bag) -> None:
+    wanted = [number for number, (topic, kind, cdr) in topics.items() if cdr and bag.uses(topic, kind)]
+    messages, damaged = 0, 0
+    for row in _rows(connection, wanted):
+        number, log_time, octets = row or (None, None, None)
+        if number not in topics or log_time is None:
+            damaged += 1
             continue
-        number, log_time, octets = row
-        if number not in topics or not isinstance(log_time, int):
-            pages += 1
-            continue
-        topic, kind, encoding = topics[number]
-        count += 1
-        if encoding == 'cdr':
-            intake.unpack(0 if octets is None else len(octets))
-            intake.count(topic, kind, log_time)
+        topic, kind, cdr = topics[number]
+        messages += 1
+        if cdr:
+            bag.unpack(len(octets or b''))
+            bag.count(topic, kind, log_time)
         if isinstance(octets, bytes):
-            try:
-                octets = unpacked_message(octets)
-            except Exception:  # damaged bytes can raise anything; they do not decode, which is told then
-                pass
-            intake.keep(Record(topic, kind, octets, log_time))
-    if pages:
-        intake.problems.append(f'{name} is cut or damaged (in {pages} or more places); '
-                               f'{count} message(s) were read')
+            bag.keep(Record(topic, kind, unpacked_message(octets, bag.unpack), log_time))
+    if damaged:
+        bag.problems.append(f'{name} is cut or damaged (in {damaged} or more places); '
+                               f'{messages} message(s) were read')
 
 
 def _rows(connection: sqlite3.Connection, wanted: list[int]
-          ) -> Iterator[tuple[int, int, bytes | None] | None]:
+          ) -> Iterator[tuple[int | None, int | None, bytes | None] | None]:
     """
     Yield number of the topic, time, and bytes if the topic is wanted, of each message.
 
     None stands for a damaged page, whose messages are missing.
     """
-    query = ('SELECT rowid, topic_id, timestamp, CASE WHEN topic_id IN '
-             f'({",".join(str(int(number)) for number in wanted)}) THEN data END '
-             'FROM messages NOT INDEXED WHERE rowid >= ? ORDER BY rowid')
+    # The type of a value is read without the value, which might be large.
+    integers = ', '.join(f"CASE WHEN typeof({column}) = 'integer' THEN {column} END"
+                         for column in ('topic_id', 'timestamp'))
+    choice = ', '.join(str(int(number)) for number in wanted)
+    query = (f"SELECT rowid, {integers}, CASE WHEN typeof(topic_id) = 'integer' AND topic_id IN ({choice}) "
+             'THEN data END FROM messages NOT INDEXED WHERE rowid >= ? ORDER BY rowid')
     start = 1
     for _ in range(PAGES):
         try:
@@ -118,25 +151,20 @@ def _rows(connection: sqlite3.Connection, wanted: list[int]
 
 def _after(connection: sqlite3.Connection, query: str, start: int) -> int | None:
     """Return the first row id behind a damaged page at which reading can go on; None: there is none."""
-    def readable(rowid: int) -> bool | None:
-        """Whether there is a readable row from this one on; None: there is no row at all."""
+    def readable(rowid: int) -> bool:
+        """Whether nothing is damaged at the first row from this one on."""
         try:
-            return True if connection.execute(query, (rowid,)).fetchone() else None
+            connection.execute(query, (rowid,)).fetchone()
         except sqlite3.OperationalError:
             raise
         except sqlite3.DatabaseError:
             return False
+        return True
 
-    good = 1
-    while readable(start + good) is False:
-        good *= 2
-        if start + good >= 2**62:
+    step = 1
+    while not readable(start + step):
+        step *= 2
+        if start + step >= 2**62:
             return None
-    bad = good // 2
-    while good - bad > 1:
-        middle = (good + bad) // 2
-        if readable(start + middle) is False:
-            bad = middle
-        else:
-            good = middle
-    return start + good
+    first = start + step // 2 + 1  # the last one that was tried is damaged
+    return first + bisect_left(range(first, start + step), True, key=readable)

@@ -4,8 +4,7 @@
 """What follows from a fit: intervals, which parameters are identifiable, the next action, what is missing."""
 
 from dlo_calibration.inference.advice import Advice, advise
-from dlo_calibration.inference.confirmation import Confirmation
-from dlo_calibration.inference.examination import Examination, examine
+from dlo_calibration.inference.examination import Confirmation, Examination, examine
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.trial_information import TrialInformation

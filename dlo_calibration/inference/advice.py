@@ -2,18 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Advice: which action to observe next, so that the least certain parameter becomes more certain.
+Advice: the action to observe next, so that the least certain parameter becomes more certain.
 
-Each candidate is simulated with the found parameters and with slightly different
-ones.  The differences of the simulated chains, divided by the error of the
-residuals, give the information that the trial would add (the expected covariance
-of Bayesian experimental design, Chaloner and Verdinelli, Bayesian Experimental
-Design: A Review, 1995, section 2).
+Each candidate is simulated with the found parameters and beside them.  The derivatives of the simulated
+chains, divided by the error of the residuals, give the information that the trial would add (the expected
+covariance of Bayesian experimental design: Chaloner and Verdinelli, Bayesian Experimental Design: A
+Review, 1995, section 2).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
+from operator import itemgetter
 from typing import Iterator, Sequence
 
 import numpy as np
@@ -21,9 +22,8 @@ from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.linearisation import (
-    both_sides,
+    Differences,
     information,
-    slope,
     standard_deviations,
     STEP,
     WIDEST,
@@ -78,12 +78,12 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
     """
     Return the action that reduces the largest standard deviation most.
 
-    If no action helps for the least certain parameter, the next one is tried, until all that are left
-    are identifiable, or actions were simulated for `MOST_SOUGHT`.  To save rollouts, only that parameter is
-    varied at first; for the three best actions, all others are then varied, too.
+    The parameters are tried from the least certain one on, until an action helps, the others are
+    identifiable, or actions were simulated for `MOST_SOUGHT` of them.  To save rollouts, only this parameter
+    is varied at first; the others are varied for the three best actions alone.
 
     :param point: (d,) the found values in the unit cube.
-    :param uncertainty: the present one.
+    :param uncertainty: of the parameters now.
     :param length: of the DLO [m].
     :return: None if no action helps, every parameter is identifiable, or there is no covariance.
     :raises CancelledError: when stopped.
@@ -92,13 +92,10 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
         return None
     possible, known = list(candidates(trials)), np.linalg.inv(uncertainty.covariance)
 
-    def simulated(some: Sequence[Candidate], shown: NDArray[np.bool_]
-                  ) -> Iterator[tuple[Candidate, Floats | None]]:
-        found = sensitivities([one.trial for one in some], space, pool, point, uncertainty.std, length,
-                              shown=np.tile(shown, (len(some), 1)))
-        for candidate, one in zip(some, found, strict=True):
-            # None: this DLO does not allow the action.
-            yield candidate, None if isinstance(one, SimulationError) else one
+    def derivatives(actions: Sequence[Candidate], varied: NDArray[np.bool_]
+                    ) -> list[Floats | SimulationError]:
+        return sensitivities([candidate.trial for candidate in actions], space, pool, point,
+                             uncertainty.std, length, shown=np.tile(varied, (len(actions), 1)))
 
     sought: set[int] = set()
     for k in np.argsort(-uncertainty.std, kind='stable').tolist():
@@ -107,24 +104,24 @@ def advise(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, point: Fl
             return None
         alone = np.arange(space.dimension) == k
         promising: list[tuple[float, Candidate, Floats]] = []
-        showing = [one for one in possible
-                   if excites([one.trial], space, np.inf)[0, k]]  # a table may be anywhere
+        showing = [candidate for candidate in possible
+                   if excites([candidate.trial], space, np.inf)[0, k]]  # a table may be anywhere
         if showing:
             sought.add(k)
-        for candidate, matrix in simulated(showing, alone):
-            if matrix is None:
+        for candidate, column in zip(showing, derivatives(showing, alone), strict=True):
+            if isinstance(column, SimulationError):  # this DLO does not allow the action
                 possible.remove(candidate)
                 continue
             # The other parameters count as known: no more is possible.
-            at_best = float((now**-2 + information(matrix, uncertainty.scale)[k, k])**-0.5)
+            at_best = float((now**-2 + information(column, uncertainty.scale)[k, k])**-0.5)
             if at_best < WORTH_IT * now:
-                promising.append((at_best, candidate, matrix))
+                promising.append((at_best, candidate, column))
         best: tuple[float, Candidate] | None = None
-        promising = sorted(promising, key=lambda one: one[0])[:3]
-        others = simulated([one[1] for one in promising], ~alone)
-        for (_, candidate, matrix), (_, rest) in zip(promising, others, strict=True):
-            if rest is not None:
-                std = float(standard_deviations(known + information(matrix + rest, uncertainty.scale))[k])
+        promising = sorted(promising, key=itemgetter(0))[:3]
+        others = derivatives([candidate for _, candidate, _ in promising], ~alone)
+        for (_, candidate, column), rest in zip(promising, others, strict=True):
+            if not isinstance(rest, SimulationError):
+                std = float(standard_deviations(known + information(column + rest, uncertainty.scale))[k])
                 if std < WORTH_IT * now and (best is None or std < best[0]):
                     best = std, candidate
         if best is not None:
@@ -139,41 +136,37 @@ def sensitivities(trials: Sequence[Trial], space: ParameterSpace, pool: Pool, po
                   length: float, *, shown: NDArray[np.bool_], at_rest: bool = True
                   ) -> list[Floats | SimulationError]:
     """
-    Return the (m, d) derivative of the simulated chains of each trial [m per unit cube].
+    Return the (m, d) derivatives of the simulated chains of each trial [m per unit cube].
 
-    The steps of the central differences are the standard deviations, because the chains may be nonlinear
-    within such a distance.
+    The central differences have steps of the standard deviations, because the chains may be nonlinear within
+    such a distance.
 
     :param std: (d,) standard deviations in the unit cube.
     :param length: of the DLO [m].
     :param shown: (trials, d) False for parameters that a trial cannot show: their columns are zero without a
         rollout.
     :param at_rest: whether to refuse a rollout that does not come to rest; if not, its last state counts.
-    :return: in place of a derivative, why there is none: a rollout diverges, or does not come to rest.
+    :return: for a trial without derivatives the reason: a rollout diverges, or does not come to rest.
     :raises CancelledError: when stopped.
     """
     steps = np.clip(std, STEP, WIDEST)
-    beside = [both_sides(point, [k], steps) for k in range(len(point))]
-    physical = [[space.physical(space.values(one), length) for one in both] for both in beside]
-    jobs = [(trial, one) for trial, row in zip(trials, shown, strict=True)
-            for k in np.flatnonzero(row) for one in physical[k]]
+    sides = [Differences.central(point, np.flatnonzero(row), steps) for row in shown]
+    jobs = [(trial, space.physical(space.values(beside), length))
+            for trial, differences in zip(trials, sides, strict=True) for beside in differences.points]
     rollouts = iter(pool.simulate(jobs))
-    found: list[Floats | SimulationError] = []
-    for trial, row in zip(trials, shown, strict=True):
-        matrix, failure = np.zeros((3 * len(trial.goals) * len(trial.initial), len(point))), None
-        for k in np.flatnonzero(row):
-            chains = []
-            for one in (next(rollouts), next(rollouts)):
-                if isinstance(one, SimulationError):
-                    failure = one
-                elif at_rest and not all(one.settled):
-                    failure = SimulationError(f'trial {trial.name!r} does not come to rest')
-                else:
-                    chains.append(one.chains.ravel())
-            if failure is None:
-                matrix[:, k] = slope(beside[k][:, k], chains)
-        found.append(matrix if failure is None else failure)
-    return found
+    derivatives: list[Floats | SimulationError] = []
+    for trial, differences in zip(trials, sides, strict=True):
+        chains, failure = [], None
+        for rollout in islice(rollouts, len(differences.points)):
+            if isinstance(rollout, SimulationError):
+                failure = rollout
+            elif at_rest and not all(rollout.settled):
+                failure = SimulationError(f'trial {trial.name!r} does not come to rest')
+            else:
+                chains.append(rollout.chains.ravel())
+        unknown = np.zeros((3 * len(trial.goals) * len(trial.initial), len(point)))
+        derivatives.append(differences.jacobian(unknown, chains) if failure is None else failure)
+    return derivatives
 
 
 def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
@@ -184,7 +177,7 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
     across = np.array([-along[1], along[0], 0.0])
     if not np.linalg.norm(across) > 1e-6 * length:
         across = np.array([0.0, 1.0, 0.0])
-    side = tuple(float(one) for one in across / np.linalg.norm(across))
+    side = tuple((across / np.linalg.norm(across)).tolist())
     gap = float(np.linalg.norm(along))
     cm = f'{30 * length:.0f} cm'
     for fraction, place in ((0.0, 'the first end'), (0.5, 'the middle')):
@@ -215,7 +208,7 @@ def candidates(trials: Sequence[Trial]) -> Iterator[Candidate]:
 def _beyond(chain: Chain, fraction: float, across: Floats) -> tuple[float, ...]:
     """Return the (3,) place [m] a tenth of the length beside the DLO, at a fraction of its arc length."""
     place = chain.resample(np.array([fraction * chain.length]))[0]
-    return tuple(float(one) for one in place - 0.1 * chain.length * across / np.linalg.norm(across))
+    return tuple((place - 0.1 * chain.length * across / np.linalg.norm(across)).tolist())
 
 
 def _candidate(words: str, chain: Chain, named: NamedAction, watched: bool = False) -> Iterator[Candidate]:

@@ -4,24 +4,22 @@
 """
 Examination: simulations around the found parameters, after a search has ended.
 
-These are simulated: each parameter changed in both directions; finer nodes and
-steps; initial chains with other noise; the default parameters; a step towards the optimum of the
-other trials for each trial that is left out; and the ends of wide intervals.
-The module `uncertainty` computes the intervals from them.
+It simulates each parameter changed in both directions; finer nodes and steps; initial chains with other
+noise; the default parameters; for each trial, a step towards the optimum of the others; and the ends of wide
+intervals.  The module `uncertainty` computes the intervals from these.  A confirmation compares the engine
+with a second one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import both_sides, Linearisation, slope, STEP, WIDEST
-from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.linearisation import Differences, Linearisation, STEP, WIDEST
+from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.inference.cross_validation import Evaluate, left_out_errors
 from dlo_calibration.inference.uncertainty import (
     at_minimum,
@@ -33,7 +31,11 @@ from dlo_calibration.inference.uncertainty import (
 from dlo_calibration.model.chain import Floats, frozen_array
 from dlo_calibration.model.score import PointErrors
 
-#: Gives the residuals (m,) [m] of points that are being evaluated, None for a failure.
+#: Two engines agree if their points of a trial are no further apart on average [m]: about the
+#: discretisation error of nodes and time step, 0.43 mm on the reference objects (doc/physics.md).
+DISTANCE_TOLERANCE = 0.5e-3
+
+#: Returns the residuals (m,) [m] of points that are being evaluated, None for a failure.
 Ended = Callable[[], Sequence[Floats | None]]
 
 #: Standard deviation (unit cube) above which a small step is not enough: contact and friction have kinks.
@@ -78,8 +80,8 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
     :param evaluate: simulates the trials.
     :param default: (d,) the default parameters.
     :param noise: noise level, see `Examination` [m].
-    :param finer: gives the residuals at `point` with more nodes and a smaller step; None: this is left out.
-    :param starts: each gives those with initial chains of other noise; may be empty.
+    :param finer: returns the residuals at `point` with more nodes and a smaller step; None: not simulated.
+    :param starts: each returns those with initial chains of other noise; may be empty.
     :param fading: (d,) False for parameters whose effect is much the same along their scale; None: all may
         fade or have kinks.
     """
@@ -99,13 +101,14 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
         count += 1
         fine, = finer()
         shift = np.ones(len(point)) if fine is None else optimum_shift(fit, fine)
-    drawn = [one for start in starts for one in start()]
+    drawn = [residuals for start in starts for residuals in start()]
     count += len(drawn)
-    found = at_minimum(fit, layout, noise=noise, shift=shift,
-                       starts=[one for one in drawn if one is not None])
-    found = extended(fit, found, residuals_at, fading)
+    uncertainty = at_minimum(fit, layout, noise=noise, shift=shift,
+                             starts=[residuals for residuals in drawn if residuals is not None])
+    uncertainty = extended(fit, uncertainty, residuals_at, fading)
     return Examination(
-        uncertainty=found, jacobian=frozen_array(fit.jacobian), noise=noise, regular=_converged(fit, found),
+        uncertainty=uncertainty, jacobian=frozen_array(fit.jacobian), noise=noise,
+        regular=_converged(fit, uncertainty),
         cross_validated=float(np.concatenate(fold_errors).mean()) if fold_errors else float('nan'),
         default_error=float('nan') if at_default is None else PointErrors.of(at_default).mean,
         evaluations=count)
@@ -113,21 +116,19 @@ def examine(point: Floats, residuals: Floats, layout: ResidualLayout, evaluate: 
 
 def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residuals_at: Evaluate,
                 noise: float, fading: NDArray[np.bool_]) -> Linearisation:
-    """Return the linearised residuals; uncertain parameters take steps of their standard deviations."""
+    """Return the linear model of the residuals; uncertain parameters take wide steps."""
     dimension = len(point)
 
-    def columns(wanted: Sequence[int], steps: Floats) -> list[Floats]:
-        sides = [both_sides(point, [k], steps) for k in wanted]
+    def measured(columns: Sequence[int], steps: Floats) -> Floats:
+        sides = Differences.central(point, columns, steps)
         # One side, the one towards the middle, shows an effect that is much the same along the scale.
         beside = [both if fading[k] else both[[int(point[k] < 0.5)]]
-                  for k, both in zip(wanted, sides, strict=True)]
-        seen = iter(residuals_at(np.concatenate(beside)))
-        found = [slope((point[k], *one[:, k]), (residuals, *islice(seen, len(one))))
-                 for k, one in zip(wanted, beside, strict=True)]
-        return [np.zeros_like(residuals) if one is None else one for one in found]
+                  for k, both in zip(columns, sides.beside, strict=True)]
+        sides = replace(sides, beside=beside)
+        return sides.jacobian(np.zeros((len(residuals), dimension)), residuals_at(sides.points), residuals)
 
     steps = np.full(dimension, STEP)
-    jacobian = np.stack(columns(range(dimension), steps), axis=1)
+    jacobian = measured(range(dimension), steps)
     for _ in range(2):
         std = at_minimum(Linearisation(point, residuals, jacobian), layout, noise=noise).std
         wider = np.where(std > SUSPECT, np.clip(std, 0.1, WIDEST), steps)
@@ -135,27 +136,28 @@ def _linearised(point: Floats, residuals: Floats, layout: ResidualLayout, residu
         if not weak:
             break
         steps[weak] = wider[weak]
-        for k, column in zip(weak, columns(weak, steps), strict=True):
+        wide = measured(weak, steps)
+        for k in weak:
             # A small step may see a kink and no slope, so that the smaller effect counts.
-            if np.linalg.norm(column) < np.linalg.norm(jacobian[:, k]):
-                jacobian[:, k] = column
+            if np.linalg.norm(wide[:, k]) < np.linalg.norm(jacobian[:, k]):
+                jacobian[:, k] = wide[:, k]
     return Linearisation(point, residuals, jacobian)
 
 
-def extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
+def extended(fit: Linearisation, uncertainty: Uncertainty, residuals_at: Evaluate,
              fading: NDArray[np.bool_]) -> Uncertainty:
     """
-    Return intervals that are extended to where the residuals really change as much as the linear fit says.
+    Extend intervals to where the simulated residuals change as much as the linear model says.
 
     The effect of a stiffness fades as it grows: one end of an interval may fit clearly worse, the other not.
     An end whose effect is below 90 % of the expected one moves to twice its distance, four times at most;
-    after that, it is the end of the scale.  The standard deviations grow with them.
+    after that, it is the end of the scale.  The standard deviations grow with the intervals.
     """
-    point, ends, limits = fit.point, np.stack([found.lower, found.upper]), (0.0, 1.0)
-    excited = np.flatnonzero(found.excited)
-    needed = DEVIATIONS * found.std * 0.9
+    point, ends, limits = fit.point, np.stack([uncertainty.lower, uncertainty.upper]), (0.0, 1.0)
+    excited = np.flatnonzero(uncertainty.excited)
+    needed = DEVIATIONS * uncertainty.std * 0.9
     unsure = [(side, int(k)) for k in excited for side in (0, 1)
-              if found.std[k] > SUSPECT and ends[side, k] != limits[side] and fading[k]]
+              if uncertainty.std[k] > SUSPECT and ends[side, k] != limits[side] and fading[k]]
     for _ in range(4):
         if not unsure:
             break
@@ -163,24 +165,67 @@ def extended(fit: Linearisation, found: Uncertainty, residuals_at: Evaluate,
         for row, (side, k) in zip(there, unsure, strict=True):
             row[k] = ends[side, k]
         still = []
-        for (side, k), one in zip(unsure, residuals_at(there), strict=True):
-            if one is None:
+        for (side, k), residuals in zip(unsure, residuals_at(there), strict=True):
+            if residuals is None:
                 continue
             own = fit.columns(excited).own_weights(int(np.searchsorted(excited, k)))
-            if abs(float(own @ (one - fit.residuals))) < needed[k]:
+            if abs(float(own @ (residuals - fit.residuals))) < needed[k]:
                 ends[side, k] = np.clip(2 * ends[side, k] - point[k], *limits)
                 if ends[side, k] != limits[side]:
                     still.append((side, k))
         unsure = still
     for side, k in unsure:
         ends[side, k] = limits[side]
-    return found.within(ends[0], ends[1])
+    return uncertainty.within(ends[0], ends[1])
 
 
-def _converged(fit: Linearisation, found: Uncertainty) -> bool:
+def _converged(fit: Linearisation, uncertainty: Uncertainty) -> bool:
     """Tell whether the next Gauss-Newton step is small: 3 standard deviations (squared: 9) per parameter."""
     free = replace(fit, residuals=Huber.of(fit.residuals).clipped(fit.residuals)).columns(
-        found.excited & ~found.at_bound)
+        uncertainty.excited & ~uncertainty.at_bound)
     count = len(free.point)
-    step = free.step(np.eye(count) * found.residual**2)
-    return -float(free.gradient @ step) <= 9.0 * count * found.scale**2
+    step = free.step(np.eye(count) * uncertainty.residual**2)
+    return -float(free.gradient @ step) <= 9.0 * count * uncertainty.scale**2
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """
+    What a second engine gives for the found parameters.
+
+    :param engine: the second engine's name.
+    :param score: its average difference score over the trials [cm].
+    :param scores: its difference score of each trial [cm].
+    :param errors: its point errors against the observed chains.
+    :param mean_distance: mean distance between the points of both engines, over all goals [m].
+    :param max_distance: the largest of these distances [m].
+    """
+
+    engine: str
+    score: float
+    scores: tuple[float, ...]
+    errors: PointErrors
+    mean_distance: float
+    max_distance: float
+
+
+def disagreements(names: Sequence[str], chains: Sequence[Floats], others: Sequence[Floats],
+                  scores: Sequence[float], other_scores: Sequence[float]) -> list[str]:
+    """
+    Return a phrase for each trial on which two engines disagree.
+
+    :param names: of the trials.
+    :param chains: (g, n, 3) [m] simulated points of each trial, by the first engine.
+    :param others: the same by the second engine.
+    :param scores: difference score of each trial, by the first engine.
+    :param other_scores: the same by the second engine.
+    """
+    words = []
+    for name, points, other_points, score, other_score in zip(
+            names, chains, others, scores, other_scores, strict=True):
+        distance = float(np.linalg.norm(points - other_points, axis=2).mean())
+        # A difference of scores below 5 % or 0.1 cm is too small to prefer one parameter set to another.
+        if distance > DISTANCE_TOLERANCE or abs(other_score - score) > max(0.1, 0.05 * score):
+            words.append(f'{name}: points {distance * 1e3:.2f} mm apart on average, '
+                         f'score {other_score:.2f} instead of {score:.2f}')
+    return words

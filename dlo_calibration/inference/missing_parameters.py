@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_calibration.evaluation.batch import BatchEvaluator
 from dlo_calibration.evaluation.linearisation import Linearisation, perpendicular
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import (
     BY_NAME,
@@ -23,7 +23,7 @@ from dlo_calibration.model.parameters import (
     REST_SHAPE,
     SCALE,
 )
-from dlo_calibration.search.bounded import bounded_least_squares
+from dlo_calibration.search.descent import bounded_least_squares
 
 PARTS = 'parts'  # stands for parts of different bending stiffness
 MOVE = 0.15  # change of a parameter, in the unit cube: well above the noise of a simulation
@@ -48,14 +48,14 @@ def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace
     """
     Return the parameters that would explain at least a tenth of the squared residuals, largest share first.
 
-    Each parameter that was held fixed is changed once.  Only the part of its
-    effect counts that the free parameters cannot imitate (a score test: Rao,
-    Linear Statistical Inference and Its Applications, 1973, 6e.3).
+    Each parameter that was held fixed is changed once.  Of its effect, only the part counts that the free
+    parameters cannot imitate (a score test: Rao, Linear Statistical Inference and Its Applications, 1973,
+    6e.3).
 
     :param space: of the calibration.
     :param evaluate: returns an evaluator for another space, which compares the goals that `fit` does.
-    :param fit: the residuals at the found parameters, linearised.
-    :param parts: False: the calibration has tried parts of different stiffness.
+    :param fit: linear model of the residuals at the found parameters.
+    :param parts: False: the calibration has already tried parts of different stiffness.
     :raises CancelledError: when stopped.
     """
     roots = Huber.of(fit.residuals).roots(fit.residuals)
@@ -63,25 +63,26 @@ def missing_parameters(space: ParameterSpace, evaluate: Callable[[ParameterSpace
     left = perpendicular(weighted.jacobian, weighted.residuals)
     begun = [(name, evaluate(wider).begin(np.hstack([np.tile(fit.point, (len(moves), 1)), moves])))
              for name, wider, moves in _candidates(space, parts)]
-    found = []
-    for name, residuals in begun:
-        columns = [perpendicular(weighted.jacobian, roots * (seen - fit.residuals))
-                   for seen in residuals() if seen is not None]
+    missing = []
+    for name, ended in begun:
+        columns = [perpendicular(weighted.jacobian, roots * (residuals - fit.residuals))
+                   for residuals in ended() if residuals is not None]
         share = _explained(left, columns, BY_NAME[name] if name != PARTS else None)
         if share >= 0.1:
-            found.append(MissingParameter(name, share))
-    return tuple(sorted(found, key=lambda one: -one.share))
+            missing.append(MissingParameter(name, share))
+    return tuple(sorted(missing, key=lambda parameter: -parameter.share))
 
 
 def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str, ParameterSpace, Floats]]:
-    """Yield each name, the space with its a parameters added, and k values (k, a) to try in the unit cube."""
+    """Yield each name, the space with its a parameters added, and (k, a) values to try in the unit cube."""
     for parameter in PARAMETERS:
         name = parameter.name
         if name in space.free or name in (*PART_NAMES, *REST_SHAPE) or _is_idle(name, space):
             continue
         fixed = {key: value for key, value in space.fixed.items() if key != name}
         now = space.fixed.get(name, parameter.default) / SCALE
-        step = 0.5 if _is_absent(parameter, now) else MOVE
+        # At the lower end of a logarithmic scale, such an effect is absent.
+        step = 0.5 if parameter.neutral == 0 and not parameter.linear and now == 0 else MOVE
         yield (name, replace(space, free=(*space.free, name), fixed=fixed),
                np.array([[now + step if now + step <= 1 else now - step]]))
     if parts and space.parts == 1 and 'flexibility' in space.free:
@@ -91,15 +92,10 @@ def _candidates(space: ParameterSpace, parts: bool = True) -> Iterator[tuple[str
 
 
 def _is_idle(name: str, space: ParameterSpace) -> bool:
-    """Tell whether a parameter has no effect of its own beside those that this DLO has."""
+    """Tell whether a parameter has no effect of its own beside the free and the fixed ones."""
     if name == 'bending_slip':
         return 'bending_friction' not in space.free and not space.fixed.get('bending_friction', 0.0)
     return name == 'mass' and not space.mass_known or name == 'natural_curvature' and space.knots > 0
-
-
-def _is_absent(parameter: Parameter, now: float) -> bool:
-    """Tell whether the effect is absent, as the value is at the lower end of a logarithmic scale."""
-    return parameter.neutral == 0 and not parameter.linear and now == 0
 
 
 def _explained(left: Floats, columns: Sequence[Floats], parameter: Parameter | None) -> float:

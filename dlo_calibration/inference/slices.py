@@ -14,8 +14,7 @@ from typing import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from dlo_calibration.evaluation.batch import BatchEvaluator
-from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluation, Evaluator
 from dlo_calibration.evaluation.pool import Pool
 from dlo_calibration.inference.examination import Examination
 from dlo_calibration.model.chain import Floats, frozen_array
@@ -68,7 +67,7 @@ class Slices:
 
     :param lines: for each parameter, or `chosen` ones of many.
     :param evaluations: number of parameter sets that were simulated.
-    :param complete: False if the time was too short: some slices are coarse or missing.
+    :param complete: False if the time was too short, so that some slices are coarse or missing.
     """
 
     lines: tuple[Line, ...]
@@ -86,8 +85,8 @@ def simulate_slices(evaluator: Evaluator, best: Evaluation, std: Floats, examina
 
     :param best: the evaluation of the found values.
     :param std: (d,) their standard deviations in the unit cube.
-    :param examination: of their surroundings; None if there was none.
-    :param executor: simulates them, as in `Pool`.
+    :param examination: of the found values; None if there was none.
+    :param executor: its workers simulate, as in `Pool`.
     :param seconds: time limit [s].
     :param should_stop: asked often; once True, the slices so far are returned.
     :param clock: the time [s].
@@ -135,41 +134,41 @@ class _Grid:
         self._evaluate = evaluate
         self._best = best
         reach = np.maximum(4.0 * std, NARROWEST / SCALE)
-        self._ends = [(max(0.0, value - one), min(1.0, value + one))
-                      for value, one in zip(best.point.tolist(), reach.tolist(), strict=True)]
-        self._seen: dict[tuple[float, ...], Evaluation] = {}
+        self._ends = [(max(0.0, value - size), min(1.0, value + size))
+                      for value, size in zip(best.point.tolist(), reach.tolist(), strict=True)]
+        self._evaluations: dict[tuple[float, ...], Evaluation] = {}
         self._names = evaluate.evaluator.space.free
 
     @property
     def count(self) -> int:
         """Number of simulated points."""
-        return len(self._seen)
+        return len(self._evaluations)
 
     def simulate(self, varied: Sequence[int], drawn: Sequence[tuple[int, int]], level: int) -> None:
-        """Simulate what lines and planes need, as far as there is time, those of the lines first."""
+        """Simulate what lines and planes need, lines first, until the time is up."""
         changed = [{k: float(value)} for k in varied for value in self._values(k, level)]
         changed += [dict(zip(pair, map(float, values), strict=True)) for pair in drawn
                     for values in product(*(self._values(k, level) for k in pair))]
-        known = {tuple(self._best.point.tolist()), *self._seen}
+        known = {tuple(self._best.point.tolist()), *self._evaluations}
         new = [point for point in dict.fromkeys(map(self._key, changed)) if point not in known]
         if new:
             for point, evaluation in zip(new, self._evaluate(np.array(new), 0), strict=False):
-                self._seen[point] = evaluation
+                self._evaluations[point] = evaluation
 
     def line(self, k: int, level: int) -> Line:
-        """Vary one parameter; its values include the found one."""
+        """Return the line of one parameter; its values include the found one."""
         values = np.unique([*self._values(k, level), self._best.point[k]])
-        found = [self._at({k: float(value)}) for value in values]
-        scores, errors = _outcomes(found)
+        scores, errors = _outcomes([self._at({k: float(value)}) for value in values])
         return Line(self._names[k], frozen_array(values * SCALE), frozen_array(scores), frozen_array(errors))
 
     def plane(self, pair: tuple[int, int], level: int) -> Plane:
-        """Vary two parameters."""
-        one, two = (self._values(k, level) for k in pair)
-        found = [self._at({pair[0]: float(a), pair[1]: float(b)}) for a in one for b in two]
-        scores, errors = (values.reshape(len(one), len(two)) for values in _outcomes(found))
-        return Plane((self._names[pair[0]], self._names[pair[1]]), frozen_array(np.stack([one, two]) * SCALE),
-                     frozen_array(scores), frozen_array(errors))
+        """Return the plane of two parameters."""
+        first, second = (self._values(k, level) for k in pair)
+        evaluations = [self._at({pair[0]: float(a), pair[1]: float(b)}) for a in first for b in second]
+        scores, errors = (values.reshape(len(first), len(second)) for values in _outcomes(evaluations))
+        return Plane((self._names[pair[0]], self._names[pair[1]]),
+                     frozen_array(np.stack([first, second]) * SCALE), frozen_array(scores),
+                     frozen_array(errors))
 
     def _values(self, k: int, level: int) -> Floats:
         low, high = self._ends[k]
@@ -187,12 +186,13 @@ class _Grid:
         point = self._key(changes)
         if point == self._key({}):
             return self._best
-        if point not in self._seen:
+        if point not in self._evaluations:
             raise CancelledError
-        return self._seen[point]
+        return self._evaluations[point]
 
 
-def _outcomes(found: Sequence[Evaluation]) -> Iterator[Floats]:
+def _outcomes(evaluations: Sequence[Evaluation]) -> Iterator[Floats]:
     """Yield the scores [cm], then the root mean square errors [m]."""
-    yield np.array([one.score for one in found])
-    yield np.array([np.inf if one.errors is None else one.errors.rms for one in found])
+    yield np.array([evaluation.score for evaluation in evaluations])
+    yield np.array([np.inf if evaluation.errors is None else evaluation.errors.rms
+                    for evaluation in evaluations])

@@ -1,29 +1,57 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trial information: how much more certain one trial makes the parameters, before any calibration."""
+"""
+Trial information: how much more certain one trial makes the parameters.
+
+Before a calibration, an appraiser simulates each new trial.  It measures the derivatives of the chains near
+the best values known so far, which follow the trials by Gauss-Newton steps.  It computes the uncertainty as a
+calibration does: from the residuals, the noise of the initial chains, a finer simulation, and the ends of
+wide intervals.  Only the search for the best values is shorter, and fewer goals of a stream are compared.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Sequence
+import zlib
 
 import numpy as np
 
-from dlo_calibration.evaluation.linearisation import information, standard_deviations
-from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.inference.examination import Examination
+from dlo_calibration.errors import SimulationError
+from dlo_calibration.evaluation.linearisation import (
+    information,
+    Linearisation,
+    standard_deviations,
+    STEP,
+    WIDEST,
+)
+from dlo_calibration.evaluation.pool import Pool
+from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
+from dlo_calibration.inference.advice import sensitivities
+from dlo_calibration.inference.examination import Examination, extended
 from dlo_calibration.inference.uncertainty import (
+    at_minimum,
     IDENTIFIABLE,
     NOT_IDENTIFIABLE,
+    optimum_shift,
     prior_information,
+    Uncertainty,
     UNKNOWN_STD,
     WEAK,
 )
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.model.parameters import knot_names, KNOTS, SCALE
-from dlo_calibration.model.trial import Trial
+from dlo_calibration.model.parameters import knot_names, KNOTS, ParameterSpace, REST_SHAPE, SCALE
+from dlo_calibration.model.score import residuals, seen_points
+from dlo_calibration.model.trial import Goal, shown_goals, Trial
+from dlo_calibration.observation.excitation import excites
+from dlo_calibration.observation.noise import NO_NOISE, with_other_noise
 
+ROUNDS = 8  # Gauss-Newton steps to the best values, at most
+WORTH_A_STEP = 0.02  # share of the cost that a step must promise to save
+WORTH_A_MOVE = 0.1  # share of the cost that a value must save to which no derivative points
+TRIED_VALUES = (0.15, 0.4, 0.65, 0.9)  # values of a parameter of which nothing is known
+STARTS = 4  # simulations of each trial from initial chains with other noise
 #: A trial is informative if it reduces a standard deviation below this share; repeating one leaves 0.71.
 NEW = 0.6
 
@@ -89,12 +117,12 @@ class TrialInformation:
     @property
     def _so_far(self) -> str:
         """The verdicts in words; those on knots of a rest shape are left out."""
-        told = []
+        words = []
         for verdict in (IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE):
-            names = [name for name, one in zip(self.names, self.verdicts, strict=False) if one == verdict
+            names = [name for name, own in zip(self.names, self.verdicts, strict=False) if own == verdict
                      and name not in knot_names(KNOTS[-1])]
-            told += [f'{verdict}: {", ".join(names)}'] * bool(names)
-        return f'; so far {"; ".join(told)}' if told else ''
+            words += [f'{verdict}: {", ".join(names)}'] * bool(names)
+        return f'; so far {"; ".join(words)}' if words else ''
 
     @property
     def values(self) -> dict[str, Any]:
@@ -104,7 +132,7 @@ class TrialInformation:
         return {f'{key}_{name}': float(std) * SCALE for key, column in (
             ('std_before', self.before), ('std_after', self.after))
             for name, std in zip(self.names, column, strict=True)} | {
-                f'verdict_{name}': one for name, one in zip(self.names, self.verdicts, strict=False)}
+                f'verdict_{name}': verdict for name, verdict in zip(self.names, self.verdicts, strict=False)}
 
 
 def std_of_each_alone(trials: Sequence[Trial], examination: Examination) -> Floats:
@@ -116,7 +144,7 @@ def std_of_each_alone(trials: Sequence[Trial], examination: Examination) -> Floa
 
 def uninformative(trials: Sequence[Trial], examination: Examination | None) -> tuple[str, ...]:
     """
-    Return the names of the calibrated trials that say nothing about any parameter; () if that is unknown.
+    Return the names of the calibrated trials that inform about no parameter; () if that is unknown.
 
     Each of them alone would leave every standard deviation above 95 % of that of the prior.
     """
@@ -124,3 +152,243 @@ def uninformative(trials: Sequence[Trial], examination: Examination | None) -> t
         return ()
     return tuple(trial.name for trial, std in zip(trials, std_of_each_alone(trials, examination), strict=True)
                  if (std > 0.95 * UNKNOWN_STD).all())
+
+
+@dataclass(frozen=True, eq=False)
+class TrialModel:
+    """
+    The simulations of one trial.
+
+    :param fit: linear model of its residuals.
+    :param moved: (STARTS, m) change of the residuals [m] by other noise of the initial chain.
+    :param finer: (m,) change of the residuals [m] by a finer simulation.
+    :param complete: False: `moved` and `finer` are not simulated yet; until then, and where they cannot be
+        simulated, they are 0.
+    """
+
+    fit: Linearisation
+    moved: Floats
+    finer: Floats
+    complete: bool = False
+
+    def near(self, point: Floats) -> bool:
+        """Tell whether the model holds at a (d,) point, in the parameters that the trial shows."""
+        shown = np.any(self.fit.jacobian != 0, axis=0)
+        return bool((np.abs(point - self.fit.point)[shown] <= STEP).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Appraisal:
+    """
+    What some trials make known before any calibration.
+
+    :param names: of the d parameters.
+    :param point: (d,) their best values.
+    :param uncertainty: of them.
+    :param models: of the first trials; the others are simulated when the next trial comes.
+    """
+
+    names: tuple[str, ...]
+    point: Floats
+    uncertainty: Uncertainty
+    models: tuple[TrialModel, ...] = ()
+
+    @classmethod
+    def before(cls, names: tuple[str, ...], point: Floats) -> Appraisal:
+        """Return what is known before any simulation, with a (d,) point to begin at."""
+        known = np.ones(len(names))
+        return cls(names, point, Uncertainty(
+            UNKNOWN_STD * known, 0 * known, known, known == 0, known == 0,
+            UNKNOWN_STD**2 * np.eye(len(names))))
+
+
+def without_repeated_goals(trial: Trial) -> Trial:
+    """
+    Return a trial without the goals that add little.
+
+    Of several goals of the same DLO at rest, the first stays; of those in motion, a few stay, evenly spread.
+    The outcome does not change while a tracker continues to show a DLO at rest.
+    """
+    goals: list[Goal] = []
+    moving = [goal for goal in trial.goals if not goal.stable]
+    shown = {id(moving[k]) for k in shown_goals(len(moving))} if moving else set()
+    rests = set()
+    for goal in trial.goals:
+        rest = (sum(hand.start <= goal.time for hand in trial.hands), goal.held_by)
+        if id(goal) in shown or goal.stable and rest not in rests:
+            goals.append(goal)
+            if goal.stable:
+                rests.add(rest)
+    return replace(trial, goals=tuple(goals))
+
+
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """The (m,) residuals [m] of all trials at a (d,) point, the models of the trials, and the uncertainty."""
+
+    residuals: Floats
+    point: Floats
+    models: tuple[TrialModel, ...]
+    uncertainty: Uncertainty
+
+    @property
+    def loss(self) -> Huber:
+        """The loss that suits the residuals."""
+        return Huber.of(self.residuals)
+
+
+@dataclass(frozen=True)
+class Appraiser:
+    """
+    Estimates from simulations of trials how certain they make the parameters.
+
+    :param length: of the DLO [m].
+    :param table_height: [m]; None if there is no table.
+    :param noise: noise level: standard deviation of one measured coordinate [m]; nan if unknown.
+    :param guessed: names of the parameters that cannot be estimated from the observed chains alone.
+    """
+
+    space: ParameterSpace
+    pool: Pool
+    length: float
+    table_height: float | None
+    noise: float
+    guessed: tuple[str, ...] = ()
+
+    def after(self, before: Appraisal, trials: Sequence[Trial]) -> Appraisal:
+        """
+        Return the appraisal of all trials; `before` is that of all but the last.
+
+        A trial is simulated again if the best values have moved away from its model.
+
+        :raises SimulationError: if a trial cannot be simulated.
+        :raises CancelledError: when the pool stops.
+        """
+        trials = [without_repeated_goals(trial) for trial in trials]
+        models = [*before.models, *[None] * (len(trials) - len(before.models))]
+        best = self._minimum(trials, models, before.point, before.uncertainty.std)
+        elsewhere = self._better_start(trials, best)
+        if elsewhere is not None:
+            other = self._minimum(trials, [None] * len(trials), elsewhere, before.uncertainty.std)
+            best = min(best, other, key=lambda minimum: best.loss.cost(minimum.residuals))
+        return self._examined(before.names, trials, best.point, tuple(
+            model if model.complete else self._completed(model, trial)
+            for model, trial in zip(best.models, trials, strict=True)))
+
+    def _minimum(self, trials: Sequence[Trial], models: Sequence[TrialModel | None], point: Floats,
+                 std: Floats) -> _Minimum:
+        """
+        Return where Gauss-Newton steps from a (d,) point end.
+
+        Unlike a search, it simulates a trial only where its model among `models` does not hold, and halves
+        steps that lead too far.
+        """
+        best: _Minimum | None = None
+        for _ in range(ROUNDS):
+            try:
+                now = tuple(model if model is not None and model.near(point) else
+                            self._model(trial, point, std)
+                            for model, trial in zip(models, trials, strict=True))
+            except SimulationError:
+                if best is None:
+                    raise
+                point = (point + best.point) / 2
+                continue
+            models = now
+            fit, layout = _whole(now, trials, point)
+            loss = Huber.of(fit.residuals)
+            if best is not None:
+                same = min(loss, best.loss)
+                if same.cost(fit.residuals) > same.cost(best.residuals):  # too far
+                    point = (point + best.point) / 2
+                    continue
+            uncertainty = at_minimum(fit, layout, noise=self.noise)
+            best = _Minimum(fit.residuals, point, now, uncertainty)
+            weighted = fit.weighted(loss.roots(fit.residuals) / uncertainty.scale)
+            step = weighted.step(prior_information(len(point)))
+            there = np.clip(point + np.clip(step, -WIDEST, WIDEST), 0.0, 1.0)
+            saved = loss.cost(fit.residuals) - loss.cost(fit.predicted(there - point))
+            if saved < WORTH_A_STEP * loss.cost(fit.residuals):
+                break
+            point, std = there, uncertainty.std
+        assert best is not None
+        return best
+
+    def _better_start(self, trials: Sequence[Trial], best: _Minimum) -> Floats | None:
+        """
+        Return a (d,) point that fits clearly better than a minimum; None if there is none.
+
+        A parameter that the trials show may be so far from its default that no derivative there points to it,
+        such as the elasticity of a DLO that is much more elastic than a rope.
+        """
+        shown = np.logical_or.reduce(excites(trials, self.space, self.table_height))
+        start, cost = best.point, best.loss.cost(best.residuals)
+        for k, name in enumerate(self.space.free):
+            if name not in self.guessed or not shown[k] or best.uncertainty.verdicts[k] != NOT_IDENTIFIABLE:
+                continue
+            points = [np.where(np.arange(len(start)) == k, value, start) for value in TRIED_VALUES]
+            costs = [best.loss.cost(self._residuals(trials, point)) for point in points]
+            if min(costs) < (1 - WORTH_A_MOVE) * cost:
+                start, cost = points[int(np.argmin(costs))], min(costs)
+        return None if start is best.point else start
+
+    def _examined(self, names: tuple[str, ...], trials: Sequence[Trial], point: Floats,
+                  models: tuple[TrialModel, ...]) -> Appraisal:
+        fit, layout = _whole(models, trials, point)
+        shift = optimum_shift(fit, fit.residuals + np.concatenate([model.finer for model in models]))
+        starts = fit.residuals + np.hstack([model.moved for model in models])
+        uncertainty = at_minimum(fit, layout, noise=self.noise, shift=shift, starts=starts)
+        fading = np.array([name not in REST_SHAPE for name in self.space.free])
+        return Appraisal(names, point, extended(
+            fit, uncertainty, lambda points: [self._residuals(trials, beside) for beside in points], fading),
+            models)
+
+    def _residuals(self, trials: Sequence[Trial], point: Floats) -> Floats | None:
+        """Return the residuals (m,) [m] of all trials at a (d,) point; None if one cannot be simulated."""
+        try:
+            return np.concatenate([self._simulated(trial, point) for trial in trials])
+        except SimulationError:
+            return None
+
+    def _simulated(self, trial: Trial, point: Floats, pool: Pool | None = None) -> Floats:
+        physical = self.space.physical(self.space.values(point), self.length)
+        rollout, = (pool or self.pool).simulate([(trial, physical)])
+        if isinstance(rollout, SimulationError):
+            raise rollout
+        return residuals(trial, rollout.chains)
+
+    def _model(self, trial: Trial, point: Floats, std: Floats) -> TrialModel:
+        """Simulate a trial around a (d,) point; a parameter that it certainly cannot show is not varied."""
+        shown, here = excites([trial], self.space, self.table_height)[0], self._simulated(trial, point)
+        jacobian, = sensitivities([trial], self.space, self.pool, point, std, self.length,
+                                  shown=shown[None], at_rest=False)
+        if isinstance(jacobian, SimulationError):
+            raise jacobian
+        rows = np.repeat(seen_points(trial).ravel(), 3)
+        return TrialModel(Linearisation(point, here, jacobian[rows]),
+                          np.zeros((STARTS, len(here))), np.zeros(len(here)))
+
+    def _completed(self, model: TrialModel, trial: Trial) -> TrialModel:
+        """Return a model with the effects of other noise of the initial chain and of a finer simulation."""
+        point, moved, finer, fine = model.fit.point, model.moved, model.finer, self.pool.refined()
+        generator = np.random.default_rng(zlib.crc32(trial.initial.points.tobytes()))  # the same each time
+        try:
+            if self.noise > NO_NOISE and 'length_scale' not in self.space.free:
+                moved = np.array([self._simulated(noisy, point) - model.fit.residuals
+                                  for noisy, in with_other_noise([trial], self.noise, STARTS, generator)])
+            if fine is not None:
+                finer = self._simulated(trial, point, fine) - model.fit.residuals
+        except SimulationError:
+            pass
+        finally:
+            if fine is not None:
+                fine.simulator.close()
+        return replace(model, moved=moved, finer=finer, complete=True)
+
+
+def _whole(models: Sequence[TrialModel], trials: Sequence[Trial], point: Floats
+           ) -> tuple[Linearisation, ResidualLayout]:
+    """Return the linear model of all trials at a (d,) point, and the layout of its residuals."""
+    fits = [model.fit for model in models]
+    return Linearisation(point, np.concatenate([fit.predicted(point - fit.point) for fit in fits]),
+                         np.concatenate([fit.jacobian for fit in fits])), ResidualLayout.of(trials)

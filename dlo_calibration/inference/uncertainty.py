@@ -4,9 +4,9 @@
 """
 Uncertainty: the covariance and the intervals of the calibrated parameters, in the unit cube.
 
-If the search ended in a regular minimum, the covariance follows from the
-Jacobian of the residuals there.  The textbook's formula alone is several times
-too small for real DLOs.  Six things are therefore added:
+If the search ended in a regular minimum, the covariance follows from the Jacobian of the residuals there.
+The textbook's formula alone is several times too small for real DLOs.  Therefore it takes six more effects
+into account:
 
 - the errors of neighbouring points are correlated, so that these count as fewer;
 - the initial chain of each trial is measured with noise, too, and so are length and shape of the DLO;
@@ -16,20 +16,20 @@ too small for real DLOs.  Six things are therefore added:
 - trials that look alike share the error of the model, so that repeating one averages only its noise;
 - the reported point may be beside the minimum, after a search that does not converge (`Uncertainty.at`).
 
-If it did not, as in a random search, the spread of the best evaluations is used.
+After any other search, such as a random one, the spread of the best evaluations is used.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Sequence
+from typing import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_calibration.evaluation.evaluation import Evaluation
 from dlo_calibration.evaluation.linearisation import Linearisation, Rows, TINY
-from dlo_calibration.evaluation.residuals import ResidualLayout
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.residuals import Huber, ResidualLayout
 from dlo_calibration.model.chain import Floats, frozen_array
 
 UNKNOWN_STD = 1 / np.sqrt(12)  # of the uniform distribution on 0..1, which is the prior
@@ -55,18 +55,6 @@ def verdict(lower: float, upper: float) -> str:
     if width > WEAK_WIDTH:
         return NOT_IDENTIFIABLE
     return WEAK if cut or width > IDENTIFIABLE_WIDTH else IDENTIFIABLE
-
-
-class Scored(Protocol):
-    """A point of the unit cube with its score."""
-
-    @property
-    def point(self) -> Floats:
-        """The (d,) point."""
-
-    @property
-    def score(self) -> float:
-        """Lower is better."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +86,14 @@ class Uncertainty:
         return tuple(map(verdict, self.lower.tolist(), self.upper.tolist()))
 
     def of_excited(self, excited: NDArray[np.bool_]) -> Uncertainty:
-        """Return the uncertainty with parameters that are not excited, (d,) False, unknown."""
+        """Return the uncertainty in which parameters that are not excited, (d,) False, are unknown."""
         return replace(
             self, excited=excited, std=frozen_array(np.where(excited, self.std, UNKNOWN_STD)),
             lower=frozen_array(np.where(excited, self.lower, 0.0)),
             upper=frozen_array(np.where(excited, self.upper, 1.0)))
 
     def within(self, lower: Floats, upper: Floats) -> Uncertainty:
-        """Return the uncertainty with wider intervals, (d,) each, and standard deviations that agree."""
+        """Return the uncertainty with wider intervals, (d,) each, and standard deviations to match."""
         std = np.maximum(self.std, np.minimum((upper - lower) / (2 * DEVIATIONS), UNKNOWN_STD))
         wider = std / self.std
         return replace(
@@ -115,10 +103,10 @@ class Uncertainty:
 
     def at(self, point: Floats, there: Floats, remaining: Floats) -> Uncertainty:
         """
-        Return the uncertainty at another point, which may not be quite a minimum.
+        Return the uncertainty at another point, which may be beside the minimum.
 
-        The standard deviations become the root mean square distance of the parameters from it.  Ends of the
-        scale stay ends of the intervals.
+        A standard deviation becomes the root mean square distance of the parameter from that point.  An
+        interval that reaches an end of the scale still does.
 
         :param point: (d,) that this is the uncertainty at.
         :param there: (d,) the other point.
@@ -143,9 +131,9 @@ class Uncertainty:
         if self.covariance is None:
             return None
         std = np.sqrt(np.diag(self.covariance))
-        found = (self.covariance + self.covariance.T) / 2 / np.outer(std, std)
-        np.fill_diagonal(found, 1.0)
-        return np.asarray(np.clip(found, -1.0, 1.0))  # rounding may lead beyond
+        correlations = (self.covariance + self.covariance.T) / 2 / np.outer(std, std)
+        np.fill_diagonal(correlations, 1.0)
+        return np.asarray(np.clip(correlations, -1.0, 1.0))  # rounding may lead beyond
 
     @property
     def undetermined(self) -> tuple[Floats, ...]:
@@ -165,14 +153,13 @@ def good_count(evaluations: int) -> int:
     return max(8, round(0.05 * evaluations))
 
 
-def spread_of_best(evaluations: Sequence[Scored], best: Floats) -> Uncertainty:
+def spread_of_best(evaluations: Sequence[Evaluation], best: Floats) -> Uncertainty:
     """
     Return the spread of the parameters of the best evaluations.
 
-    A parameter that the trials determine has similar values in all good
-    evaluations; the others scatter.  `std` is the root mean square distance of
-    the best 5 % (8 at least) from the (d,) point `best`; `lower` and `upper` are
-    the extremes of all of them.  With too few evaluations, no parameter is identifiable.  The
+    A parameter that the trials determine has similar values in all good evaluations; the others scatter.
+    `std` is the root mean square distance of the best 5 %, but at least 8, from the (d,) point `best`;
+    `lower` and `upper` are their extremes.  With too few evaluations, no parameter is identifiable.  The
     spread depends on the search as much as on the trials.
     """
     good = sorted((e for e in evaluations if np.isfinite(e.score)), key=lambda e: e.score)
@@ -198,7 +185,7 @@ def noise_alone(residual: float, noise: float) -> bool:
 
 
 def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = float('nan'),
-               shift: Floats | None = None, starts: Sequence[Floats] = ()) -> Uncertainty:
+               shift: Floats | None = None, starts: Sequence[Floats] | Floats = ()) -> Uncertainty:
     """
     Return the uncertainty that follows from the linearised residuals at a minimum.
 
@@ -228,7 +215,7 @@ def at_minimum(fit: Linearisation, layout: ResidualLayout, *, noise: float = flo
     if shift is not None:
         extra = extra + (2 * shift)**2  # twice as fine halves the error, which is of first order
     if len(starts):  # the noise of each trial's own initial chain moves the optimum by a Gauss-Newton step
-        moved = np.array([loss.clipped(one) - clipped for one in starts])
+        moved = np.array([loss.clipped(residuals) - clipped for residuals in starts])
         pulls = [moved[:, rows] @ fit.jacobian[rows] / scale**2 for rows in layout.rows]
         step = np.linalg.inv(weighted.information + prior)
         moves = step @ together(pulls, shared) @ step / len(starts)
@@ -250,7 +237,7 @@ def at_end(point: Floats) -> NDArray[np.bool_]:
 
 
 def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
-    """Return the indices of T trials in groups that show the same: their derivatives are nearly parallel."""
+    """Group the indices of T trials that show the same, because their derivatives are nearly parallel."""
     sides = [block.ravel() for block in layout.aligned(fit.jacobian)]
     sizes = [max(float(np.linalg.norm(side)), TINY) for side in sides]
     groups: list[list[int]] = []
@@ -266,10 +253,10 @@ def alike(fit: Linearisation, layout: ResidualLayout) -> list[list[int]]:
 
 def shared_error(residuals: Floats, layout: ResidualLayout, groups: Sequence[Sequence[int]]) -> Floats:
     """
-    Return (T, T): the correlation of the errors of any two of T trials; 0 between those of different groups.
+    Return the (T, T) correlations of the errors of T trials; 0 between trials of different groups.
 
-    It is the mean correlation of their residuals (m,) [m], as far as it is positive: 1 for a trial that is
-    repeated to the digit, near 0 where the model is right and only the noise is new each time.
+    They are the mean correlations of the residuals (m,) [m], or 0 if that is negative: 1 for an exact repeat
+    of a trial, near 0 where the model is right and only the noise is new each time.
     """
     shared, blocks = np.eye(len(layout.shapes)), layout.aligned(residuals)
     for group in groups:
@@ -300,8 +287,8 @@ def shared_information(fit: Linearisation, layout: ResidualLayout, shared: Float
 def together(blocks: Sequence[Floats], shared: Floats) -> Floats:
     """Return (d, d): the products B_t^T B_s of T blocks (r, d), summed with the weights `shared`, (T, T)."""
     dimension = blocks[0].shape[1]
-    return sum((shared[one, other] * blocks[one].T @ blocks[other]
-                for one, other in np.argwhere(shared).tolist()), np.zeros((dimension, dimension)))
+    return sum((shared[k, other] * blocks[k].T @ blocks[other]
+                for k, other in np.argwhere(shared).tolist()), np.zeros((dimension, dimension)))
 
 
 def jackknife(fit: Linearisation, groups: Sequence[Rows], prior: Floats) -> Floats:
@@ -343,26 +330,26 @@ def bootstrap(fit: Linearisation, groups: Sequence[Rows], prior: Floats, draws: 
 
 def correlation_length(residuals: Floats, layout: ResidualLayout) -> float:
     """
-    Return how many neighbouring residuals count as one, >= 1: along the DLO and in time, they are correlated.
+    Return how many neighbouring residuals count as one, >= 1: they are correlated along the DLO and in time.
 
-    This is the product of the integrated autocorrelation lengths, 1 + 2 sum rho_k (Priestley,
+    It is the product of the integrated autocorrelation lengths, 1 + 2 sum rho_k (Priestley,
     Spectral Analysis and Time Series, 1981, 5.3), along the DLO and over the goals of a trial.
     Each sum ends before the first rho_k that white noise could have.
     """
-    spread = layout.chains(residuals)
-    power = float(np.mean([np.nanmean(np.square(block)) for block in spread]))
-    blocks = [np.nan_to_num(block) for block in spread]  # points that were not seen add nothing
-    known = [np.isfinite(block) for block in spread]
+    chains = layout.chains(residuals)
+    power = float(np.mean([np.nanmean(np.square(block)) for block in chains]))
+    blocks = [np.nan_to_num(block) for block in chains]  # points that were not seen add nothing
+    seen = [np.isfinite(block) for block in chains]
     lengths = []
     for axis in (1, 0):
         length, turned = 1.0, [np.moveaxis(block, axis, 0) for block in blocks]
-        there = [np.moveaxis(block, axis, 0) for block in known]
+        known = [np.moveaxis(block, axis, 0) for block in seen]
         for lag in range(1, max(len(block) for block in turned) // 2 + 1):
             pairs = [(block[lag:], block[:-lag]) for block in turned if lag <= len(block) // 2]
-            count = sum(int(np.sum(one[lag:] & one[:-lag])) for one in there if lag <= len(one) // 2)
+            count = sum(int(np.sum(block[lag:] & block[:-lag])) for block in known if lag <= len(block) // 2)
             if not count:
                 break
-            product = sum(float(np.vdot(one, other)) for one, other in pairs) / count
+            product = sum(float(np.vdot(later, earlier)) for later, earlier in pairs) / count
             correlation = product / power if power > 0 else 0.0
             if correlation < 2 / np.sqrt(count):
                 break

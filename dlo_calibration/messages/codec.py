@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache, cached_property
 import importlib
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, ClassVar, Mapping, Union
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import far_from_unit, MAXIMUM_HANDS, quaternion_lengths
-from dlo_calibration.model.chain import Chain, check_ends, check_size, Floats, frozen_array, MOST_POINTS
+from dlo_calibration.model.action import check_waypoints, MAXIMUM_HANDS
+from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array, MOST_POINTS
 
 INITIAL, ACTION, GOAL = 'initial_chain', 'action', 'goal_chain'
 INPUT_TYPES: Mapping[str, str] = {
@@ -23,6 +23,17 @@ INPUT_TYPES: Mapping[str, str] = {
     ACTION: 'trajectory_msgs/msg/MultiDOFJointTrajectory',
     GOAL: 'sensor_msgs/msg/PointCloud2',
 }
+#: What the node sends, name -> type; recorded with its inputs.
+OUTPUT_TYPES: Mapping[str, str] = {
+    'progress': 'diagnostic_msgs/msg/DiagnosticArray',
+    'result': 'diagnostic_msgs/msg/DiagnosticArray',
+    'dlo_description': 'std_msgs/msg/String',
+    'status': 'diagnostic_msgs/msg/DiagnosticArray',
+    'markers': 'visualization_msgs/msg/MarkerArray',
+}
+
+RANKS = {INITIAL: 0, ACTION: 1, GOAL: 2}  # order of messages with equal stamps
+Key = tuple[int, int, tuple[str, ...]]  # by which messages are sorted; each collected message has its own
 
 NANOSECONDS = 10**9  # in a second
 MAXIMUM_WAYPOINTS = 100_000  # of an action; a quarter of an hour at 100 Hz
@@ -31,7 +42,6 @@ MAXIMUM_DURATION = 86_400.0  # s, of an action; a stamp sent as time_from_start 
 UINT8, FLOAT32, FLOAT64 = 2, 7, 8  # datatypes of sensor_msgs/PointField
 FIELD_TYPES = {1: 'int8', UINT8: 'uint8', 3: 'int16', 4: 'uint16', 5: 'int32', 6: 'uint32',
                FLOAT32: 'float32', FLOAT64: 'float64'}
-CODES = {UINT8: 'u1', FLOAT32: 'f4', FLOAT64: 'f8'}  # of NumPy
 COORDINATES = ('x', 'y', 'z')
 
 
@@ -69,9 +79,9 @@ class ChainMessage:
         return named(self.kind, self.stamp)
 
     @cached_property
-    def length(self) -> float:
-        """Length of the curve through the points [m]."""
-        return self.chain.length
+    def key(self) -> Key:
+        """Its place in the order of messages."""
+        return self.stamp, RANKS[self.kind], ()
 
 
 @dataclass(frozen=True)
@@ -92,6 +102,8 @@ class ActionMessage:
     times: Floats
     positions: Floats
     orientations: Floats
+
+    kind: ClassVar[str] = ACTION
 
     def __post_init__(self) -> None:
         names = tuple(self.names)
@@ -115,31 +127,11 @@ class ActionMessage:
                 thing, f'times {times.shape}, positions {positions.shape}, orientations '
                 f'{orientations.shape}', '(k,), (k, h, 3) and (k, h, 4) for k waypoints of h hands',
                 'give every hand one pose per waypoint')
-        for name, values in (('time_from_start', times), ('translation', positions),
-                             ('rotation', orientations)):
-            bad = np.flatnonzero(~np.isfinite(values.reshape(count, -1)).all(axis=1))
-            if len(bad):
-                raise InputError(thing, f'NaN or infinity in {name} of trajectory point {bad[0]}',
-                                 'finite numbers', 'leave such points out')
-        check_size(thing, 'trajectory point', positions)
+        check_waypoints(thing, 'trajectory point', names, {
+            'time_from_start': times, 'translation': positions, 'rotation': orientations}, MINIMUM_STEP)
         if times[0] < 0 or times[-1] > MAXIMUM_DURATION:
             raise InputError(thing, f'time_from_start from {times[0]:g} to {times[-1]:g} s',
                              f'0 to {MAXIMUM_DURATION:g} s', 'count time_from_start from header.stamp')
-        bad = np.flatnonzero(np.diff(times) < 0.999 * MINIMUM_STEP)
-        if len(bad):
-            k = bad[0]
-            raise InputError(
-                thing,
-                f'time_from_start {times[k + 1]:.9g} s of trajectory point {k + 1} after {times[k]:.9g} s',
-                f'increasing times, by {MINIMUM_STEP:g} s at least',
-                'sort the points and leave out repeated ones')
-        norms = quaternion_lengths(orientations)
-        wrong = np.argwhere(far_from_unit(norms))
-        if len(wrong):
-            k, h = wrong[0]
-            raise InputError(
-                thing, f'a quaternion of length {norms[k, h]:g} for {names[h]} in trajectory point {k}',
-                'a unit quaternion x y z w', 'use 0 0 0 1 for a hand that does not turn')
         for name, value in (('names', names), ('times', times), ('positions', positions),
                             ('orientations', orientations)):
             object.__setattr__(self, name, value)
@@ -147,13 +139,16 @@ class ActionMessage:
     def __str__(self) -> str:
         return named(ACTION, self.stamp)
 
-    @property
-    def kind(self) -> str:
-        """The kind of message: ACTION."""
-        return ACTION
+    @cached_property
+    def key(self) -> Key:
+        """Its place in the order of messages."""
+        return self.stamp, RANKS[ACTION], self.names
 
 
-def read(kind: str, message: Any) -> ChainMessage | ActionMessage:
+Message = Union[ChainMessage, ActionMessage]
+
+
+def read(kind: str, message: Any) -> Message:
     """
     Read a message of an input topic.
 
@@ -175,12 +170,9 @@ def _read_chain(kind: str, cloud: Any, stamp: int) -> ChainMessage:
         raise InputError(thing, f'height {height} and width {width}', 'height 1 or width 1',
                          'send the ordered points along the DLO, not an image')
     count = width * height
-    if count > MOST_POINTS:  # told before they are read, as a camera image sent by mistake has many
+    if count > MOST_POINTS:  # refused unread, as a camera image sent by mistake has many
         raise InputError(thing, f'{count} points', f'at most {MOST_POINTS}',
                          'send 20 to 100 points along the DLO, not the whole scene')
-    if count and step > len(cloud.data):
-        raise InputError(thing, f'{len(cloud.data)} bytes of data', f'{count} points of {step} bytes',
-                         'send all points, or correct point_step')
     stride = step
     if height > 1:
         stride = int(cloud.row_step)
@@ -218,33 +210,33 @@ def _chain(thing: str, points: Floats, hands: Any = None, features: Any = None) 
 
 
 def _point_type(thing: str, cloud: Any, step: int) -> np.dtype[Any]:
-    """Return the dtype of one point: the fields that are used, at their offsets."""
+    """Return the dtype of field point: the fields that are used, at their offsets."""
     wanted = {**dict.fromkeys(COORDINATES, (FLOAT32, FLOAT64)), 'hand': (UINT8,), 'feature': (UINT8,)}
-    found: dict[str, tuple[str, int]] = {}
-    order = '>' if cloud.is_bigendian else '<'
-    for one in cloud.fields:
-        if one.name not in wanted:
+    layout: dict[str, tuple[str, int]] = {}
+    for field in cloud.fields:
+        if field.name not in wanted:
             continue
-        if one.name in found:
-            raise InputError(thing, f'two fields {one.name!r}', 'one', 'give every field its own name')
-        if one.datatype not in wanted[one.name] or one.count != 1:
-            came = FIELD_TYPES.get(one.datatype, f'of datatype {one.datatype}')
-            raise InputError(thing, f'field {one.name!r} {came} (count {one.count})',
-                             f'{" or ".join(FIELD_TYPES[t] for t in wanted[one.name])} (count 1)',
-                             'send it in that type' if one.name in COORDINATES else
+        if field.name in layout:
+            raise InputError(thing, f'two fields {field.name!r}', 'one', 'give every field its own name')
+        if field.datatype not in wanted[field.name] or field.count != 1:
+            came = FIELD_TYPES.get(field.datatype, f'of datatype {field.datatype}')
+            raise InputError(thing, f'field {field.name!r} {came} (count {field.count})',
+                             f'{" or ".join(FIELD_TYPES[t] for t in wanted[field.name])} (count 1)',
+                             'send it in that type' if field.name in COORDINATES else
                              'send it in that type, or under another name if it means something else')
-        code = np.dtype(order + CODES[one.datatype])
-        if one.offset + code.itemsize > step:
-            raise InputError(thing, f'field {one.name!r} at offset {one.offset} of points of {step} bytes',
+        code = np.dtype(FIELD_TYPES[field.datatype]).newbyteorder('>' if cloud.is_bigendian else '<')
+        if field.offset + code.itemsize > step:
+            raise InputError(thing,
+                             f'field {field.name!r} at offset {field.offset} of points of {step} bytes',
                              'fields inside the point', 'correct offset or point_step')
-        found[one.name] = (code.str, one.offset)
-    missing = [name for name in COORDINATES if name not in found]
+        layout[field.name] = (code.str, field.offset)
+    missing = [name for name in COORDINATES if name not in layout]
     if missing:
-        names = ' '.join(one.name for one in cloud.fields) or 'none'
+        names = ' '.join(field.name for field in cloud.fields) or 'none'
         raise InputError(thing, f'no field {" ".join(missing)} (fields: {names})', 'fields x y z',
                          'send the coordinates in metres under these names')
-    return np.dtype({'names': list(found), 'formats': [code for code, _ in found.values()],
-                     'offsets': [offset for _, offset in found.values()], 'itemsize': step})
+    return np.dtype({'names': list(layout), 'formats': [code for code, _ in layout.values()],
+                     'offsets': [offset for _, offset in layout.values()], 'itemsize': step})
 
 
 def _read_action(message: Any, stamp: int) -> ActionMessage:
@@ -313,24 +305,21 @@ def bag_types() -> MessageTypes:
                         lambda octets: np.frombuffer(octets, np.uint8), int)
 
 
-def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str, *,
-                single: bool = False) -> Any:
+def chain_cloud(types: MessageTypes, chain: Chain, stamp: int, frame_id: str) -> Any:
     """
     Build a PointCloud2 with the fields x y z, and `hand` and `feature` where they are annotated.
 
-    A point that was not seen is NaN.
+    Coordinates are float64, which is exact; those of a point that was not seen are NaN.
 
     :param stamp: [ns].
-    :param single: True: coordinates as float32; False: as float64, which is exact.
     """
-    number = FLOAT32 if single else FLOAT64
     columns: list[tuple[str, int, NDArray[Any]]] = [
-        (name, number, chain.observed[:, axis]) for axis, name in enumerate(COORDINATES)]
+        (name, FLOAT64, chain.observed[:, axis]) for axis, name in enumerate(COORDINATES)]
     if chain.hands is not None:
         columns.append(('hand', UINT8, chain.hands))
     if chain.features.any():
         columns.append(('feature', UINT8, chain.features))
-    dtype = np.dtype([(name, '<' + CODES[datatype]) for name, datatype, _ in columns])
+    dtype = np.dtype([(name, FIELD_TYPES[datatype]) for name, datatype, _ in columns]).newbyteorder('<')
     table = np.empty(len(chain), dtype)
     for name, _, values in columns:
         table[name] = values

@@ -24,34 +24,45 @@ does not order different topics, and a robot may publish an action only when it 
 - A goal chain stamped before the first action of its trial waits unused, as
   that action may still arrive.
 
-A message that does not fit those with earlier stamps is refused, but remembered: it
-is used when a late message with an earlier stamp makes it fit.  Actions and goal
-chains before the first initial chain wait (see `incomplete`).  When an initial chain
-with a later stamp arrives, they are refused together (see `take_news`, and `take_early` for
-goal chains alone, which a tracker that is on already sends).  A second
-message of the same kind and stamp (and the same hands) is refused, unless the first
-one was refused: then it replaces that one.
+A message that does not fit those with earlier stamps is refused, but stored: it is used
+if a late message with an earlier stamp makes it fit.  Actions and goal chains before the
+first initial chain wait (see `incomplete`).  If the first initial chain has a later stamp,
+they are refused together (see `take_refusals`; goal chains alone come from a tracker that
+is on already, see `take_early`).  A second message of the same kind and stamp (and the
+same hands) is refused, unless the first one was refused: then it replaces that one.
 
-Of the messages that no trial uses, between half of KEPT and KEPT are remembered, the
-latest ones.  A message that is older than these is refused.  When all remembered messages
-are too large together, those that no trial uses are forgotten; then further ones are refused.
+Of the messages that no trial uses, the latest are stored, between half of KEPT and KEPT
+of them; a message that is older than these is refused.  If all stored messages together
+are too large, those that no trial uses are deleted; further ones are then refused.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
+from bisect import bisect_right
+from dataclasses import replace
+from heapq import nlargest
 from itertools import pairwise
-from typing import Iterable, Iterator
+import math
+from typing import Iterator, Sequence
 
-from dlo_calibration.calibration.declaration import OBSERVATION
-from dlo_calibration.calibration.options import names_of, Options
+from dlo_calibration.calibration.options import names_of, OBSERVATION, Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.codec import ACTION, ActionMessage, GOAL, INITIAL, NANOSECONDS
-from dlo_calibration.messages.doubts import doubts
-from dlo_calibration.messages.manipulations import manipulation_of
-from dlo_calibration.messages.trial_builder import Key, Message, moved, order, TrialBuilder
-from dlo_calibration.model.manipulation import Manipulation
+from dlo_calibration.messages.codec import (
+    ACTION,
+    ActionMessage,
+    ChainMessage,
+    GOAL,
+    INITIAL,
+    INPUT_TYPES,
+    Key,
+    Message,
+    NANOSECONDS,
+)
+from dlo_calibration.messages.trial_builder import TrialBuilder
+from dlo_calibration.model.named_actions import Manipulation
+from dlo_calibration.model.pose import Pose
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.plausibility import implausible
 
 USED = (*names_of(OBSERVATION), 'stable_distance', 'stable_time', 'settle_limit')  # options of messages
 KEPT = 10_000  # messages that no trial uses: more than 5 minutes of a tracker at 30 Hz
@@ -74,22 +85,23 @@ class TrialCollector:
     def __init__(self, options: Options) -> None:
         self._options, self.pose = options, options.pose
         self._frame: str | None = None
-        self._builders = [TrialBuilder((0, 0, ()))]
+        self._builders = [TrialBuilder((0, 0, ()), options)]
         self._known: dict[Key, Message] = {}
         self._numbers = 0  # coordinates in them
         self._newest: Key = (0, 0, ())
-        self._spare = 0
+        self._room = KEPT  # messages until those that no trial uses are counted again
+        self._exhausted = False  # whether nothing was left to forget when a message was too much
         self._forgotten: list[tuple[Key, Key]] = []  # the first key of each span, and the key after it
-        self._news: list[InputError] = []
-        self._doubts: list[str] = []
+        self._refusals: list[InputError] = []
+        self._warnings: list[str] = []
         self._early: list[InputError] = []
 
     def with_options(self, options: Options) -> tuple[TrialCollector, Iterator[int]]:
         """
         Return a collector with other options, and steps that fill it with the same messages.
 
-        Each step collects one message, refused ones too, and gives how many are left. Where the options of
-        the observation are the same, the collector is this one, and there is no step.
+        Each step adds one message, refused ones included, and yields how many are left. If the options of the
+        observation are the same, the collector is this one, and there is no step.
         """
         if all(getattr(options, name) == getattr(self._options, name) for name in USED):
             return self, iter(())
@@ -97,107 +109,132 @@ class TrialCollector:
         return other, self._filling(other)
 
     def _filling(self, other: TrialCollector) -> Iterator[int]:
-        gone = [builder for builder in self._builders if builder.until is not None]
+        discarded = [builder for builder in self._builders if builder.until is not None]
         for left, key in zip(range(len(self._known), 0, -1), sorted(self._known), strict=True):
-            while gone and gone[0].first < key:
-                other._leave_out(gone.pop(0))
+            while discarded and discarded[0].first < key:
+                other._leave_out(discarded.pop(0))
             try:
                 other.add(self._known[key])
             except InputError:
                 pass  # it is among `other.problems`
             yield left
-        for one in gone:
-            other._leave_out(one)
-        other._early = []  # they were told
+        for builder in discarded:
+            other._leave_out(builder)
+        other._early = []  # they were reported
         for begin, end in self._forgotten:
             other._close(begin, end)
 
     def add(self, message: Message) -> None:
         """
-        Take one message, of any stamp.
+        Add one message, of any stamp.
 
         :raises InputError: where the message is refused; the trials do not change.
         """
-        key = order(message)
-        self._check(message, key)
+        key = message.key
+        self._check(message)
         place = self._place(key)
         until = self._builders[place].until
         if until is not None and (message.kind != INITIAL or key <= until):
-            return  # it belongs to the trial that was taken back, of which a tracker may send more
+            return  # it belongs to the discarded trial, of which a tracker may send more
         self._frame = message.frame_id
         self._known[key] = message
         self._numbers += _size(message)
+        self._exhausted = False
         if self.pose is not None:
-            message = moved(message, self.pose)
-        last, without_start = self._builders[-1], len(self._builders) == 1
-        if key > self._newest:
-            self._newest = key
-            if message.kind == INITIAL and last.busy:
-                self._news += last.disturbed(self._options)
-                last = TrialBuilder(key)
-                self._builders.append(last)
-            before = last.spare
-            error = last.extend(message, self._options)
-            self._spare += last.spare - before
-        elif until is not None:
-            self._builders.insert(place + 1, TrialBuilder(key))
-            error = self._builders[place + 1].extend(message, self._options)
-            self._spare += 1
-        else:
-            error = self._insert(message, key)
+            message = _moved(message, self.pose)
+        without_start, in_order = len(self._builders) == 1, key > self._newest
+        self._newest = max(self._newest, key)
+        if message.kind == INITIAL and self._builders[place].busy(key):
+            if in_order:
+                self._refusals += self._builders[place].disturbed()
+            place += 1
+            self._builders.insert(place, self._builders[place - 1].split(key))
+        builder = self._builders[place]
+        error = builder.add(message)
+        if second := builder.second_start:
+            self._builders.insert(place + 1, builder.split(second))
+        elif place + 1 < len(self._builders) and self._builders[place + 1].until is None \
+                and not builder.busy():
+            self._builders.pop(place)
+            self._builders[place].join(builder)
         if without_start and len(self._builders) > 1:
-            streamed = all(one.kind == GOAL for one in self._builders[0].waiting)
-            (self._early if streamed else self._news).extend(self._orphans())
-        if self._spare > KEPT:
+            streamed = all(waiting.kind == GOAL for waiting in self._builders[0].waiting)
+            (self._early if streamed else self._refusals).extend(self._orphans())
+        elif not in_order and len(self._builders) > 1 and key < self._builders[1].first:
+            error = self._no_start(message)
+            if message.kind != ACTION and self._builders[1].first[0] - message.stamp <= LATE:
+                self._early.append(error)  # a tracker was on before, and is slower than the initial chain
+                error = None
+        self._room -= 1
+        if self._room < 0:
             self._forget(KEPT // 2)
         if error is not None:
             raise error
-        self._doubts += doubts(self._builders, self._place(key), self._options)
+        self._inspect(self._place(key))
+
+    def _inspect(self, place: int) -> None:
+        """Look for warnings about the trial of a builder, if that is due."""
+        builder = self._builders[place] if place < len(self._builders) else None
+        if builder is None or not builder.due:
+            return
+        before = next((other.trial for other in self._builders[place - 1:0:-1] if other.complete), None)
+        table = self._options.table_height if self._options.table else None
+
+        def warnings(number: int) -> tuple[str, ...]:
+            return implausible(builder.build(f'trial {number}'), table, bool(self._options.scene), before)
+
+        if texts := warnings(place):
+            number = sum(other.complete for other in self._builders[:place + 1])
+            self._warnings += texts if number == place else warnings(number)
+            builder.warned = True
 
     def take_back(self) -> tuple[int, int]:
         """
-        Forget the messages of the newest trial, also of an incomplete one.
+        Delete the messages of the newest trial, complete or not.
 
-        Initial chains that came since stay; what else comes before the next one is not used.
+        Later initial chains stay; other messages that come before the next one are not used.
 
         :returns: the stamps between which messages are left out [ns].
         :raises InputError: if there is none.
         """
-        place = max((k for k, one in enumerate(self._builders) if one.starts and one.busy), default=0)
+        place = max((k for k, builder in enumerate(self._builders) if builder.starts and builder.busy()),
+                    default=0)
         if not place:
             raise InputError('~/discard_last', 'no trial', 'one', 'there is nothing to take back')
         builder = self._builders[place]
-        messages = builder.messages()
-        until = order(messages[-1]) if place < len(self._builders) - 1 else self._newest
+        messages = builder.messages
+        until = messages[-1].key if place < len(self._builders) - 1 else self._newest
         self._drop(messages)
-        self._spare -= builder.spare
-        self._builders[place] = TrialBuilder(builder.first, until)
+        self._exhausted = False
+        self._builders[place] = TrialBuilder(builder.first, self._options, until)
         return builder.first[0], until[0]
 
     @property
     def trials(self) -> tuple[Trial, ...]:
         """The complete trials in the order of their stamps: ``trial 1``, ``trial 2``, ..."""
         complete = [builder for builder in self._builders if builder.complete]
-        return tuple(builder.build(f'trial {k}', self._options)
-                     for k, builder in enumerate(complete, start=1))
+        trials = tuple(builder.build(f'trial {k}') for k, builder in enumerate(complete, start=1))
+        for place in range(1, len(self._builders)):
+            self._inspect(place)  # of chains that came late, each was not
+        return trials
 
     def manipulations(self) -> tuple[tuple[Manipulation, ...], tuple[InputError, ...]]:
         """
         Return what the hands did in each trial, also in those without a goal chain.
 
-        They are called ``trial 1``, ``trial 2``, ...; the errors tell why actions are not used.
+        They are called ``trial 1``, ``trial 2``, ...; the errors say why actions are not used.
         """
-        found: list[Manipulation] = []
+        manipulations: list[Manipulation] = []
         problems: list[InputError] = []
         for builder in self._builders[1:]:
-            one, errors = manipulation_of(builder, f'trial {len(found) + 1}', self._options)
-            found += [] if one is None else [one]
+            manipulation, errors = builder.manipulation(f'trial {len(manipulations) + 1}')
+            manipulations += [] if manipulation is None else [manipulation]
             problems += errors
-        return tuple(found), (*problems, *(self._orphans() if len(self._builders) == 1 else ()))
+        return tuple(manipulations), (*problems, *(self._orphans() if len(self._builders) == 1 else ()))
 
     @property
     def frame_id(self) -> str:
-        """The frame_id of all messages; empty before the first one."""
+        """The frame_id of all messages; empty before the first message."""
         return self._frame or ''
 
     @property
@@ -207,104 +244,79 @@ class TrialCollector:
 
     @property
     def incomplete(self) -> str:
-        """The messages that the newest trial lacks, in words; empty where it is complete."""
-        return self._builders[-1].lacks()
+        """A description of the messages that the newest trial lacks; empty where it is complete."""
+        return self._builders[-1].missing()
 
     @property
     def problems(self) -> tuple[InputError, ...]:
         """
         The reasons why messages are unused at present, and why earlier trials are incomplete.
 
-        They include those that later messages caused, but not those that `take_news` returns.
+        They include those that later messages caused, but not those that `take_refusals` returns.
         """
-        found = [error for builder in self._builders for _, error in builder.refused]
-        found += [error for builder in self._builders for error in builder.disturbed(self._options)]
-        for builder, following in pairwise(one for one in self._builders[1:] if one.until is None):
-            found += _cut_off(builder, f'and {following.starts[0]}',
-                              'send no initial chain before the trial is complete')
-        return tuple(found)
+        problems = [refusal.error for builder in self._builders for refusal in builder.refusals]
+        problems += [error for builder in self._builders for error in builder.disturbed()]
+        for builder, following in pairwise(each for each in self._builders[1:] if each.until is None):
+            problems += builder.incomplete(f'and {following.starts[0]}',
+                                           'send no initial chain before the trial is complete')
+        return tuple(problems)
 
     @property
     def loose_end(self) -> tuple[InputError, ...]:
         """The reason why the newest trial is incomplete if no more messages come, if there is one."""
         if len(self._builders) == 1:
             return self._orphans()
-        return _cut_off(self._builders[-1], 'and the end', 'send all messages of a trial')
+        return self._builders[-1].incomplete('and the end', 'send all messages of a trial')
 
-    def take_news(self) -> tuple[InputError, ...]:
+    def take_refusals(self) -> tuple[InputError, ...]:
         """Return, once, the refusals of waiting messages since the last call."""
-        news, self._news = self._news, []
-        return tuple(news)
+        refusals, self._refusals = self._refusals, []
+        return tuple(refusals)
 
-    def take_doubts(self) -> tuple[str, ...]:
-        """Return, once, what was found implausible about trials since the last call."""
-        doubts, self._doubts = self._doubts, []
-        return tuple(doubts)
+    def take_warnings(self) -> tuple[str, ...]:
+        """Return, once, what is implausible about trials, as far as it was noticed since the last call."""
+        warnings, self._warnings = self._warnings, []
+        return tuple(warnings)
 
     def take_early(self) -> tuple[InputError, ...]:
-        """Return, once, why goal chains that came before any action or initial chain are not used."""
+        """Return, once, the refusals of goal chains that came before any action or initial chain."""
         early, self._early = self._early, []
         return tuple(early)
 
-    def _check(self, message: Message, key: Key) -> None:
-        """Refuse a message that can never be used; forget the refused message that it replaces."""
+    def _check(self, message: Message) -> None:
+        """Refuse a message that can never be used; delete the refused message that it replaces."""
+        key = message.key
         if self._frame is not None and message.frame_id != self._frame:
             raise InputError(
                 str(message), f'frame_id {message.frame_id!r}', f'{self._frame!r} as in the first message',
                 'send all chains and actions in one frame, or reset to begin with another')
         if any(begin <= key < end for begin, end in self._forgotten):
-            raise InputError(str(message), f'it after more than {KEPT // 2} later messages',
+            raise InputError(str(message), f'it came after more than {KEPT // 2} later messages',
                              'messages in about the order of their stamps', 'send it earlier, or reset')
-        if self._full(message) and self._spare:
+        if self._full(message) and not self._exhausted:
             self._forget(0)
+            self._exhausted = True
         if self._full(message):
-            raise InputError(str(message), f'it after {len(self._known)} messages',
+            raise InputError(str(message), f'it came after {len(self._known)} messages',
                              f'at most {MOST_MESSAGES} with {MOST_NUMBERS} coordinates',
                              'calibrate with these, or reset to begin anew')
         if key not in self._known:
             return
         builder = self._builders[self._place(key)]
-        others = [(one, error) for one, error in builder.refused if order(one) != key]
-        if len(others) == len(builder.refused):
+        refused = builder.refused(key)
+        if refused is None:
             raise InputError(str(message), f'a second {message.kind} with this stamp', 'one',
                              'stamp every message with its own time, or reset to begin anew')
-        self._drop(one for one, _ in builder.refused if order(one) == key)
-        builder.refused = others
-        self._spare -= 1
+        self._drop([refused])
+        builder.remove([refused])
 
     def _full(self, message: Message) -> bool:
-        """Tell whether a message would be too much."""
+        """Return whether there is no room for a message."""
         return len(self._known) >= MOST_MESSAGES or self._numbers + _size(message) > MOST_NUMBERS
 
     def _place(self, key: Key) -> int:
         """Return the index of the builder to which a message belongs."""
         return bisect_right(self._builders, key, key=lambda builder: builder.first) - 1
-
-    def _insert(self, message: Message, key: Key) -> InputError | None:
-        """Take a message that is earlier than another; return the reason if it is not used."""
-        begin = end = self._place(key)
-        kept, later = self._builders[begin].divided(key)
-        waiting, folded, found = [message, *later], [kept], None
-        # Further builders change only until an initial chain begins the next trial.
-        while waiting:
-            for one in waiting:
-                orphans = begin == 0 and len(folded) == 1
-                if one.kind == INITIAL and folded[-1].busy and (folded[-1].starts or orphans):
-                    folded.append(TrialBuilder(order(one)))
-                error = folded[-1].extend(one, self._options)
-                if one is message:
-                    found = error
-            end += 1
-            more = end < len(self._builders) and not folded[-1].busy and self._builders[end].until is None
-            waiting = self._builders[end].messages() if more else []
-        self._spare += sum(s.spare for s in folded) - sum(s.spare for s in self._builders[begin:end])
-        self._builders[begin:end] = folded
-        if begin == 0 and len(self._builders) > 1 and order(message) < self._builders[1].first:
-            error = self._no_start(message)
-            if message.kind == ACTION or self._builders[1].first[0] - message.stamp > LATE:
-                return error
-            self._early.append(error)  # of a tracker that was on before, and slower than the initial chain
-        return found
 
     def _no_start(self, message: Message, more: int = 0) -> InputError:
         started = next((builder for builder in self._builders[1:] if builder.starts), None)
@@ -316,67 +328,69 @@ class TrialCollector:
 
     def _orphans(self) -> tuple[InputError, ...]:
         """Return one refusal for all messages before the first initial chain, if there are any."""
-        waiting = sorted(self._builders[0].waiting, key=order)
+        waiting = self._builders[0].waiting
         return (self._no_start(waiting[0], len(waiting) - 1),) if waiting else ()
 
     def _forget(self, rest: int) -> None:
-        """Forget the oldest messages that no trial uses, until `rest` of them are left."""
-        surplus = self._spare - rest
+        """
+        Forget the oldest messages that no trial uses until `rest` of them are left.
+
+        Where `rest` is not 0, nothing is forgotten unless there are more than KEPT.
+        """
+        spare = sum(builder.spare for builder in self._builders)
+        surplus = spare - rest if spare > KEPT or not rest else 0
         kept: list[TrialBuilder] = []
         for builder, following in zip(self._builders, [*self._builders[1:], None], strict=True):
-            before = builder.spare
             if surplus <= 0:
                 kept.append(builder)
-            elif builder.starts and not builder.complete and following is not None:
-                self._drop(builder.messages())
+                continue
+            forgotten = builder.spare
+            if builder.starts and not builder.complete and following is not None:
+                self._drop(builder.messages)
                 self._close(builder.first, following.first)
-                surplus -= before
             else:
                 self._trim(builder, surplus)
-                surplus -= before - builder.spare
+                forgotten -= builder.spare
                 kept.append(builder)
-        self._builders = kept
-        self._spare = sum(builder.spare for builder in kept)
+            surplus -= forgotten
+            spare -= forgotten
+        self._builders, self._room = kept, KEPT - spare
 
     def _trim(self, builder: TrialBuilder, surplus: int) -> None:
         """Forget the oldest spare messages of a builder that stays."""
         count = min(surplus, len(builder.starts) - 2)
         if count > 0:
             surplus -= count
-            self._drop(builder.starts[:count])
-            del builder.starts[:count]
-            self._close(builder.first, order(builder.starts[0]))
-            builder.first = order(builder.starts[0])
-            early = sum(order(message) < builder.first for message, _ in builder.refused)
+            builder.remove(self._drop(builder.starts[:count]))
+            self._close(builder.first, builder.starts[0].key)
+            builder.first = builder.starts[0].key
+            early = sum(refusal.key < builder.first for refusal in builder.refusals)
             surplus = max(surplus, early)
-        count = max(min(surplus, len(builder.refused)), 0)
-        self._drop(message for message, _ in builder.refused[:count])
-        del builder.refused[:count]
-        count = max(min(surplus - count, len(builder.waiting)), 0)
-        self._drop(builder.waiting[:count])
-        del builder.waiting[:count]
+        refused = builder.refusals[:max(surplus, 0)]
+        builder.remove(self._drop([refusal.message for refusal in refused]))
+        builder.remove(self._drop(builder.waiting[:max(surplus - len(refused), 0)]))
 
     def _leave_out(self, builder: TrialBuilder) -> None:
-        """Note that a trial was taken back which is later than all messages so far."""
+        """Add a discarded trial that is later than all messages so far."""
         assert builder.until is not None
-        self._builders.append(TrialBuilder(builder.first, builder.until))
+        self._builders.append(TrialBuilder(builder.first, self._options, builder.until))
         self._newest = max(self._newest, builder.until)
 
-    def _drop(self, messages: Iterable[Message]) -> None:
+    def _drop(self, messages: Sequence[Message]) -> Sequence[Message]:
         for message in messages:
-            del self._known[order(message)]
+            del self._known[message.key]
             self._numbers -= _size(message)
+        return messages
 
     def _close(self, begin: Key, end: Key) -> None:
-        """From now on, refuse messages with keys from `begin` up to, but not including, `end`."""
-        insort(self._forgotten, (begin, end))
-        merged: list[tuple[Key, Key]] = []
+        """Refuse from now on messages with keys from `begin` up to, but not including, `end`."""
+        apart: list[tuple[Key, Key]] = []
         for span in self._forgotten:
-            if merged and span[0] <= merged[-1][1]:
-                merged[-1] = (merged[-1][0], max(span[1], merged[-1][1]))
+            if span[1] < begin or end < span[0]:
+                apart.append(span)
             else:
-                merged.append(span)
-        self._forgotten = merged
+                begin, end = min(begin, span[0]), max(end, span[1])
+        self._forgotten = [*apart, (begin, end)]
 
 
 def _size(message: Message) -> int:
@@ -386,12 +400,98 @@ def _size(message: Message) -> int:
     return message.chain.points.size
 
 
-def _cut_off(builder: TrialBuilder, until: str, remedy: str) -> tuple[InputError, ...]:
-    """Return why a finished builder is no trial, if it has more than initial chains."""
-    if builder.complete or not (builder.moves or builder.waiting):
-        return ()
-    if builder.moves:
-        came = f'no goal_chain between {builder.moves[0].message} {until}'
-    else:
-        came = f'{len(builder.waiting)} goal_chain, but no action between {builder.starts[-1]} {until}'
-    return InputError(f'trial that begins with {builder.starts[-1]}', came, 'at least one', remedy),
+def _moved(message: Message, pose: Pose) -> Message:
+    """Return a message in another frame, in which its own has a pose."""
+    if isinstance(message, ActionMessage):
+        return replace(message, positions=pose.points(message.positions),
+                       orientations=pose.orientations(message.orientations))
+    return ChainMessage(message.kind, message.stamp, message.frame_id, pose.chain(message.chain))
+
+
+# [ns] Two trackers on one topic may differ by less; a restarted clock goes back further.
+MARGIN = NANOSECONDS
+
+
+class StampOrder:
+    """
+    The newest stamps of messages, which distinguish a clock that went back from a message that came late.
+
+    An action may be published only when it is over, so a message may be late by minutes.  But on one topic,
+    stamps hardly ever go back, and none goes back behind the beginning of the newest trial.
+    A message goes back if it is stamped
+
+    - more than MARGIN before the newest one of its own topic,
+    - before the newest initial chain, and
+    - before two other messages, as a single wrong stamp in the future is no clock.
+
+    If an initial chain goes back, so did the clock.  An action or a goal chain that goes back may belong to
+    either clock, so it is refused.
+
+    :param former: the order until the clock went back; None: it never did.
+    """
+
+    def __init__(self, former: StampOrder | None = None) -> None:
+        self._frame = ''
+        self._newest: dict[str, int] = {}  # of each topic
+        self._latest: list[int] = [0]  # the two newest of all topics
+        self._first: float = math.inf  # of the initial chains
+        self._former_end = 0 if former is None else former.newest
+        self._former_newest = {} if former is None else {  # of the topics that have not yet gone back
+            kind: former._newest.get(kind, 0) for kind in INPUT_TYPES}
+
+    @property
+    def newest(self) -> int:
+        """The newest stamp [ns]; 0 before the first message."""
+        return self._latest[0]
+
+    def clock_went_back(self, message: Message) -> bool:
+        """Return whether the clock went back before this message."""
+        return message.kind == INITIAL and message.frame_id == self._frame and self._goes_back(message)
+
+    def left_over(self, message: Message) -> bool:
+        """
+        Return whether this message was stamped before the clock went back, and was under way then.
+
+        It is stamped near the end of the former clock, on a topic that has not yet gone back.
+        """
+        return (message.kind in self._former_newest and message.stamp > self._former_newest[message.kind]
+                and abs(message.stamp - self._former_end) <= MARGIN and message.stamp > self.newest + MARGIN)
+
+    def check(self, message: Message) -> None:
+        """
+        Check that a message certainly belongs to the trials of the present clock.
+
+        :raises InputError: if it does not.
+        """
+        if message.frame_id != self._frame:
+            return  # the collector refuses it
+        # What is stamped before all trials can be used by none; the collector refuses it.
+        if message.kind != INITIAL and message.stamp > self._first and self._goes_back(message):
+            earlier = (self._newest[message.kind] - message.stamp) / NANOSECONDS
+            raise InputError(
+                str(message),
+                f'its stamp is {earlier:.6g} s before the newest {message.kind}, in an earlier trial',
+                'the order of stamps on each topic',
+                'stamp all messages with one clock, and send an initial_chain first after it went back')
+
+    def _goes_back(self, message: Message) -> bool:
+        return (message.stamp < self._newest.get(message.kind, 0) - MARGIN
+                and message.stamp < self._newest.get(INITIAL, 0) and message.stamp < self._latest[-1])
+
+    def add(self, message: Message) -> None:
+        """Add a message that `check` does not refuse; one in another frame than the first is ignored."""
+        self._frame = self._frame or message.frame_id
+        if message.frame_id != self._frame:
+            return
+        if message.kind == INITIAL:
+            self._first = min(self._first, message.stamp)
+        if message.stamp < self._former_end - MARGIN:
+            self._former_newest.pop(message.kind, None)
+        self._newest[message.kind] = max(self._newest.get(message.kind, 0), message.stamp)
+        self._latest = nlargest(2, {*self._latest, message.stamp})
+
+
+def went_back(before: int, now: int) -> str:
+    """Return the sentence about a clock that went from one stamp [ns] back to another."""
+    return (f'the clock went back by {(before - now) / NANOSECONDS:.6g} s (from '
+            f'{before / NANOSECONDS:.3f} to {now / NANOSECONDS:.3f})')

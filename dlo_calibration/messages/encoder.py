@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import Sequence, Union
+from typing import Sequence
 
 import numpy as np
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, NANOSECONDS
-from dlo_calibration.messages.trial_builder import order
+from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL, Message, NANOSECONDS
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, MINIMUM_SPACING
 from dlo_calibration.model.trial import Goal, Trial
@@ -22,7 +21,7 @@ SAME_OFFSET = 1e-3  # of a segment
 BEFORE = NANOSECONDS // 100  # from the chain that gives a velocity to the initial chain
 
 
-def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Union[ChainMessage, ActionMessage]]:
+def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Message]:
     """
     Return messages from which a `TrialCollector` makes the same trials, to a nanosecond.
 
@@ -32,32 +31,32 @@ def trial_messages(trials: Sequence[Trial], frame_id: str) -> list[Union[ChainMe
     hands act alone between that chain and the action, and a hand that holds the DLO in a goal,
     but moved beyond the beginning of another hand's last action.
     """
-    found: list[Union[ChainMessage, ActionMessage]] = []
+    messages: list[Message] = []
     zero = 1_700_000_000 * NANOSECONDS  # a time in 2023, as real stamps are
     for trial in trials:
-        found += _messages(trial, frame_id, zero)
+        messages += _messages(trial, frame_id, zero)
         end = max([goal.time for goal in trial.goals] + [hand.end for hand in trial.hands])
         zero += round(end * NANOSECONDS) + 10 * NANOSECONDS
-    return found
+    return messages
 
 
-def _messages(trial: Trial, frame_id: str, zero: int) -> list[Union[ChainMessage, ActionMessage]]:
+def _messages(trial: Trial, frame_id: str, zero: int) -> list[Message]:
     def at(time: float) -> int:
         return zero + round(time * NANOSECONDS)
 
     groups, initial = _numbered(trial, _groups(trial))
-    found: list[Union[ChainMessage, ActionMessage]] = []
+    messages: list[Message] = []
     if trial.velocity is None:
-        found.append(ChainMessage(INITIAL, zero - BEFORE, frame_id, initial))
+        messages.append(ChainMessage(INITIAL, zero - BEFORE, frame_id, initial))
     else:
         earlier = replace(initial, points=initial.points - trial.velocity * (BEFORE / NANOSECONDS))
-        found += [ChainMessage(INITIAL, zero - BEFORE, frame_id, earlier),
-                  ChainMessage(INITIAL, zero, frame_id, initial)]
+        messages += [ChainMessage(INITIAL, zero - BEFORE, frame_id, earlier),
+                     ChainMessage(INITIAL, zero, frame_id, initial)]
     for hands in groups:
-        found.append(action_message(hands, at(min(hand.start for hand in hands)), frame_id))
+        messages.append(action_message(hands, at(min(hand.start for hand in hands)), frame_id))
     for goal in trial.goals:
-        found.append(ChainMessage(GOAL, at(goal.time), frame_id, _annotated_goal(trial, goal, groups)))
-    return sorted(found, key=order)
+        messages.append(ChainMessage(GOAL, at(goal.time), frame_id, _annotated_goal(trial, goal, groups)))
+    return sorted(messages, key=lambda message: message.key)
 
 
 def action_message(hands: Sequence[Hand], stamp: int, frame_id: str) -> ActionMessage:
@@ -79,14 +78,14 @@ def _groups(trial: Trial) -> list[tuple[Hand, ...]]:
     for k, action in enumerate(trial.actions):
         for hand in action.hands:
             groups.setdefault((k, hand.start, hand.end), []).append(hand)
-    found: list[tuple[Hand, ...]] = []
+    complete: list[tuple[Hand, ...]] = []
     for (_, start, end), hands in sorted(groups.items(), key=lambda item: item[0][1]):
         names = {hand.name for hand in hands}
         after = [goal for goal in trial.goals if goal.time > end]
         holding = trial.holding(after[0]) if after else ()
-        found.append((*hands, *(_at_rest(hand, start, end) for hand in holding
-                                if hand.end <= start and hand.name not in names)))
-    return found
+        complete.append((*hands, *(_at_rest(hand, start, end) for hand in holding
+                                   if hand.end <= start and hand.name not in names)))
+    return complete
 
 
 def _numbered(trial: Trial, groups: list[tuple[Hand, ...]]) -> tuple[list[tuple[Hand, ...]], Chain]:
@@ -116,7 +115,7 @@ def _numbered(trial: Trial, groups: list[tuple[Hand, ...]]) -> tuple[list[tuple[
 
 
 def _tells(chain: Chain, hands: Sequence[Hand]) -> bool:
-    """Tell whether an annotated chain, and the places of the hands, give the points that hands grip."""
+    """Return whether an annotated chain, and the places of the hands, give the points that hands grip."""
     for k, hand in enumerate(hands, start=1):
         held = np.flatnonzero(chain.hands == k)
         if (tuple(held.tolist()) != tuple(sorted(hand.grips)) or hand.offset) if len(held) else \
@@ -126,7 +125,7 @@ def _tells(chain: Chain, hands: Sequence[Hand]) -> bool:
 
 
 def _tells_by_place(chain: Chain, hand: Hand) -> bool:
-    """Tell whether a hand closes at the one place of a chain that it grips."""
+    """Return whether a hand closes at the one place of a chain that it grips."""
     point, offset, distance = chain.nearest(hand.positions[0])
     return hand.grips == (point,) and abs(hand.offset - offset) < SAME_OFFSET and distance <= (
         Options().grip_tolerance if hand.offset else MINIMUM_SPACING)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Refusals: counts what is refused for one reason, so that one is told a few times, not 10,000."""
+"""Refusals: counts the refusals for each reason, so that each is reported a few times, not 10,000."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import re
 from typing import Iterable
 
 FIRST_INTERVAL, LONGEST_INTERVAL = 1.0, 60.0  # s between two reports of one reason; it doubles each time
-MOST_REASONS = 100  # that are told apart; wrong input can be wrong in any number of ways
+MOST_REASONS = 100  # that are distinguished; input can be wrong in any number of ways
 OTHER = 'other'  # the reason of all refusals beyond these
 
 #: What may differ between refusals for the same reason: quoted texts, and numbers.
@@ -20,34 +20,34 @@ _VALUES = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[-+]?\d+(?:\.\d+)?(
 @dataclass
 class _Reason:
     """
-    A reason, with the refusals that it had so far.
+    The refusals for one reason.
 
-    :param text: of its newest refusal.
-    :param count: of its refusals.
-    :param told: how many of them have been told.
-    :param due: when the next ones may be told [s].
-    :param interval: from then to the next time [s].
+    :param text: of the newest one.
+    :param count: number of refusals.
+    :param reported: number of them when they were last reported.
+    :param due: time of the next report, if there are more by then [s].
+    :param interval: from that report to the next [s].
     """
 
     text: str
     count: int = 0
-    told: int = 0
+    reported: int = 0
     due: float = float('-inf')
     interval: float = FIRST_INTERVAL
 
-    def words(self) -> str:
+    def __str__(self) -> str:
         """Return the newest refusal, and how many there were."""
         return self.text if self.count == 1 else f'{self.text} ({self.count} times)'
 
-    def tell(self, now: float) -> str:
-        """Return the words, and note that they were told."""
-        self.told, self.due = self.count, now + self.interval
+    def report(self, now: float) -> str:
+        """Return a report at the time `now` [s]."""
+        self.reported, self.due = self.count, now + self.interval
         self.interval = min(2 * self.interval, LONGEST_INTERVAL)
-        return self.words()
+        return str(self)
 
 
 class Refusals:
-    """Counts refusals as they come, and says when to tell them: the first of a reason at once."""
+    """Counts refusals; each reason is reported at once, then after 1, 2, 4, ... 60 s."""
 
     def __init__(self) -> None:
         self._reasons: dict[str, _Reason] = {}
@@ -59,29 +59,30 @@ class Refusals:
             name = OTHER
         known = self._reasons.setdefault(name, _Reason(text))
         known.text, known.count = text, known.count + 1
-        return known.words()
+        return str(known)
 
     def due(self, now: float) -> list[str]:
-        """Return, once, what is to be told at the time `now` [s]: a reason again after 1, 2, 4, ... 60 s."""
-        return [one.tell(now) for one in self._reasons.values() if one.count > one.told and now >= one.due]
+        """Return the reports that are due at the time `now` [s]."""
+        return [each.report(now) for each in self._reasons.values()
+                if each.count > each.reported and now >= each.due]
 
     def rest(self) -> list[str]:
-        """Return, once, all that has not been told."""
+        """Return the reports of all that has not been reported."""
         return self.due(float('inf'))
 
 
 def reason(text: str) -> str:
-    """Return the reason in the text of a refusal: it is the same whatever the stamps, numbers and names."""
+    """Return the reason in the text of a refusal: the text without stamps, numbers and names."""
     return _VALUES.sub('#', text)
 
 
 def counted(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return the first refusal of each reason, and how many more there are of it, in the order they came."""
-    found: dict[str, list[str]] = {}
+    """Return the first refusal of each reason in order, and how many more like it there are."""
+    by_reason: dict[str, list[str]] = {}
     for text in dict.fromkeys(texts):
         name = reason(text)
-        if name not in found and len(found) >= MOST_REASONS:
+        if name not in by_reason and len(by_reason) >= MOST_REASONS:
             name = OTHER
-        found.setdefault(name, []).append(text)
+        by_reason.setdefault(name, []).append(text)
     return tuple(first if not more else f'{first} (and {len(more)} more like it)'
-                 for first, *more in found.values())
+                 for first, *more in by_reason.values())

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from dlo_calibration.model.chain import check_size, Floats, frozen_array
 
 MAXIMUM_HANDS = 8  # the limit of the message contract
 MAXIMUM_TIME = 1e12  # s; far more than between two stamps, and steps up to it can be counted
+PATHS = 'hand_paths'  # name of explicit paths
 NO_ROTATION = (0.0, 0.0, 0.0, 1.0)  # x y z w
 
 
@@ -26,8 +28,48 @@ def quaternion_lengths(orientations: Floats) -> Floats:
 
 
 def far_from_unit(lengths: Floats) -> NDArray[np.bool_]:
-    """Tell which quaternions cannot be meant as rotations; rounded ones can, as they are normalised here."""
+    """Return which lengths no rotation can be meant by; quaternions that were rounded are normalised."""
     return (lengths < 0.5) | (lengths > 1000)
+
+
+def rotation_matrix(quaternion: Floats) -> Floats:
+    """Return the (3, 3) rotation matrix of a unit quaternion x y z w."""
+    x, y, z, w = quaternion
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+
+def check_waypoints(thing: str, what: str, names: Sequence[str], paths: Mapping[str, Floats],
+                    step: float = 0.0) -> None:
+    """
+    Refuse paths that hands cannot follow.
+
+    :param thing: their owner in the error, `what` a waypoint is called there, and `names` of the h hands.
+    :param paths: (k,) times [s], (k, ...) positions [m] and (k, h, 4) quaternions, by their names.
+    :param step: least time from one waypoint to the next [s].
+    :raises InputError: if a number is not finite or too large, times do not increase, or a quaternion is far
+        from unit length.
+    """
+    for name, values in paths.items():
+        bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        if len(bad):
+            raise InputError(thing, f'NaN or infinity in {name} of {what} {bad[0]}', 'finite numbers',
+                             'leave such points out')
+    times, positions, orientations = paths.values()
+    check_size(thing, what, positions)
+    bad = np.flatnonzero(np.diff(times) <= 0.999 * step)
+    if len(bad):
+        k = bad[0]
+        raise InputError(
+            thing, f'{next(iter(paths))} {times[k + 1]:.9g} s of {what} {k + 1} after {times[k]:.9g} s',
+            f'increasing times{f", by {step:g} s at least" if step else ""}',
+            'sort the points and leave out repeated ones')
+    norms = quaternion_lengths(orientations)
+    for k, hand in np.argwhere(far_from_unit(norms))[:1]:
+        raise InputError(
+            thing, f'a quaternion of length {norms[k, hand]:g} for {names[hand]} in {what} {k}',
+            'a unit quaternion x y z w', 'use 0 0 0 1 for a hand that does not turn')
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +114,12 @@ class Hand:
             raise InputError(
                 thing, f'{count} times, positions {positions.shape}, orientations {orientations.shape}',
                 'k times, (k, 3) positions and (k, 4) orientations', 'give one pose per waypoint')
-        if not (np.isfinite(times).all() and np.isfinite(positions).all()
-                and np.isfinite(orientations).all()):
-            raise InputError(thing, 'NaN or infinity in its path', 'finite numbers', 'correct the path')
-        check_size(thing, 'waypoint', positions)
         if np.abs(times).max() > MAXIMUM_TIME:
             raise InputError(thing, f'a waypoint at {times[np.abs(times).argmax()]:g} s',
                              f'at most {MAXIMUM_TIME:g} s', 'count seconds from the start of the trial')
-        if (np.diff(times) <= 0).any():
-            raise InputError(thing, 'waypoints whose times do not increase', 'increasing times',
-                             'sort the waypoints and remove repeated ones')
+        check_waypoints(thing, 'waypoint', (self.name,), {
+            'time': times, 'positions': positions, 'orientations': orientations[:, None]})
         norms = quaternion_lengths(orientations)[:, None]
-        bad = norms[far_from_unit(norms)]
-        if len(bad):
-            raise InputError(thing, f'a quaternion of length {bad[0]:.2g}', 'a unit quaternion x y z w',
-                             'use 0 0 0 1 for a hand that does not turn')
         object.__setattr__(self, 'grips', tuple(dict.fromkeys(int(g) for g in self.grips)))
         object.__setattr__(self, 'times', times)
         object.__setattr__(self, 'positions', positions)
@@ -130,9 +163,11 @@ class Action:
 
     hands: tuple[Hand, ...]
 
+    name: ClassVar[str] = PATHS
+
     def __post_init__(self) -> None:
         hands = tuple(self.hands)
-        names = [hand.name for hand in hands]
+        names = tuple(hand.name for hand in hands)
         if not 1 <= len(hands) <= MAXIMUM_HANDS:
             raise InputError('action', f'{len(hands)} hands', f'1 to {MAXIMUM_HANDS}',
                              'leave out the hands that hold nothing')
@@ -140,6 +175,11 @@ class Action:
             raise InputError('action', f'hands named {", ".join(names)}', 'different names',
                              'give each hand a name of its own')
         object.__setattr__(self, 'hands', hands)
+
+    @property
+    def hand_names(self) -> tuple[str, ...]:
+        """Names of its hands."""
+        return tuple(hand.name for hand in self.hands)
 
     @property
     def start(self) -> float:
@@ -150,3 +190,17 @@ class Action:
     def end(self) -> float:
         """When the last hand arrives [s]."""
         return max(hand.end for hand in self.hands)
+
+
+def check_grips(thing: str, hands: Iterable[Hand], count: int) -> None:
+    """
+    Refuse hands that grip points that a chain does not have.
+
+    :param thing: with these hands, in the error.
+    :param count: number of points of the chain.
+    :raises InputError: if there is such a hand.
+    """
+    for hand in hands:
+        if not all(0 <= grip < count for grip in hand.grips):
+            raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
+                             f'points 0 to {count - 1}', 'correct the gripped points')

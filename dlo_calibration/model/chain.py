@@ -36,12 +36,10 @@ def check_size(thing: str, what: str, positions: Floats) -> None:
     """
     Refuse finite but huge coordinates.
 
-    :param thing: that has them, in the error.
-    :param what: one of the `positions`, (n, ...) [m], is called.
+    :param thing: their owner's name in the error.
+    :param what: the name of each of the `positions`, (n, ...) [m], in the error.
     :raises InputError: if a coordinate is larger than MAXIMUM_COORDINATE.
     """
-    if np.abs(positions).max(initial=0.0) <= MAXIMUM_COORDINATE:
-        return
     rows = positions.reshape(len(positions), positions[:1].size)
     bad = np.argwhere(np.isfinite(rows) & (np.abs(rows) > MAXIMUM_COORDINATE))
     if len(bad):
@@ -96,16 +94,16 @@ def put_back(points: Floats, seen: NDArray[np.bool_], places: Floats) -> Floats:
     :param seen: (n,) which points were seen, at least three.
     :param places: (n,) increasing; arc lengths of the points, in any unit.
     """
-    kept = np.flatnonzero(seen)
-    knots, values = places[kept], points[kept]
-    found = bezier_curve(knots, values, places)
-    for end, beyond in ((0, np.arange(kept[0])), (-1, np.arange(kept[-1] + 1, len(points)))):
+    shown = np.flatnonzero(seen)
+    knots, values = places[shown], points[shown]
+    complete = bezier_curve(knots, values, places)
+    for end, beyond in ((0, np.arange(shown[0])), (-1, np.arange(shown[-1] + 1, len(points)))):
         if len(beyond):
             near = knots[end] + (1e-3 if end == 0 else -1e-3) * np.ptp(knots[[end, 1 if end == 0 else -2]])
             slope = (bezier_curve(knots, values, np.array([near]))[0] - values[end]) / (near - knots[end])
-            found[beyond] = values[end] + (places[beyond] - knots[end])[:, None] * slope
-    found[kept] = values
-    return found
+            complete[beyond] = values[end] + (places[beyond] - knots[end])[:, None] * slope
+    complete[shown] = values
+    return complete
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,9 +155,9 @@ class Chain:
                 'chain', f'{seen.sum()} of {len(points)} points that were seen, and NaN in point(s) '
                 f'{_listed(np.flatnonzero(~seen))}', f'at least {least} that were seen',
                 'observe the DLO from where less of it is hidden')
-        kept = np.flatnonzero(seen)
-        gaps = np.linalg.norm(np.diff(points[kept], axis=0), axis=1)
-        same = kept[:-1][gaps < MINIMUM_SPACING]
+        shown = np.flatnonzero(seen)
+        gaps = np.linalg.norm(np.diff(points[shown], axis=0), axis=1)
+        same = shown[:-1][gaps < MINIMUM_SPACING]
         if len(same):
             raise InputError(
                 'chain', f'coincident neighbours after point(s) {_listed(same)}',
@@ -287,7 +285,7 @@ def grip_place(places: Floats, point: int, offset: float) -> float:
 
 def check_ends(thing: str, initial: Chain) -> None:
     """
-    Refuse an initial chain that does not tell where an end of the DLO is.
+    Refuse an initial chain that does not show where an end of the DLO is.
 
     :raises InputError: if more than one point at an end was not seen; `thing` is named.
     """

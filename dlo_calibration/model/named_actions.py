@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Named actions: short descriptions of manipulations, from which the paths of the hands follow.
+Named actions: short descriptions of what hands do, from which their paths follow; and manipulations of them.
 
 A message always carries the paths themselves.  A named action computes them from the
 chain before it: each hand closes at the point that it grips, and moves at constant
@@ -13,19 +13,19 @@ as an index of the chain (negative: from its end), or as a fraction of the lengt
 which may lie between two points of the chain.  A target is given as coordinates,
 or as a direction (of any length) and a distance.
 
-The docstring of each action tells how much it shows of each of the paper's four parameters.
+The docstring of each action says how much it shows of each of the paper's four parameters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar, Mapping, Sequence
+from typing import ClassVar, Iterable, Mapping, Sequence, Union
 
 import numpy as np
 
-from dlo_calibration.errors import InputError, meant, one_of
-from dlo_calibration.model.action import Action, Hand
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.errors import InputError, one_of, suggestion
+from dlo_calibration.model.action import Action, check_grips, Hand, PATHS
+from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
 
 Numbers = tuple[float, ...]
 
@@ -47,15 +47,16 @@ class NamedAction:
     start: float = 0.0
     hold: bool = False
 
+    name: ClassVar[str]  # of its element in a request
     may_be_flat: ClassVar[bool] = False  # a height of 0 means no lift
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, list):
-                object.__setattr__(self, one.name, tuple(value))
-            elif isinstance(value, (int, np.integer, np.floating)) and one.type == 'float':
-                object.__setattr__(self, one.name, float(value))
+                object.__setattr__(self, field.name, tuple(value))
+            elif isinstance(value, (int, np.integer, np.floating)) and field.type == 'float':
+                object.__setattr__(self, field.name, float(value))
         if not 0 <= self.start <= MOST:
             raise self._refused(f'start {self.start:g} s', f'0 to {MOST:g} s')
         for name in ('speed', 'height', 'distance'):
@@ -63,11 +64,6 @@ class NamedAction:
             if value is not None and not 1e-9 <= value <= MOST and not (
                     name == 'height' and value == 0 and self.may_be_flat):
                 raise self._refused(f'{name} {value:g}', f'a {name} above 0, at most {MOST:g}')
-
-    @property
-    def name(self) -> str:
-        """Its name in NAMED_ACTIONS."""
-        return next(name for name, kind in NAMED_ACTIONS.items() if kind is type(self))
 
     @property
     def hand_names(self) -> tuple[str, ...]:
@@ -88,11 +84,11 @@ class NamedAction:
     def _refused(self, came: str, expected: str, remedy: str = 'correct the action') -> InputError:
         return InputError(f'action {self.name}', came, expected, remedy)
 
-    def _require_one(self, one: str, other: str, remedy: str) -> None:
+    def _require_either(self, name: str, other: str, remedy: str) -> None:
         """Raise an error unless exactly one of two fields is given."""
-        values = getattr(self, one), getattr(self, other)
+        values = getattr(self, name), getattr(self, other)
         if (values[0] is None) == (values[1] is None):
-            raise self._refused(f'{one} {values[0]}, {other} {values[1]}', 'one of the two', remedy)
+            raise self._refused(f'{name} {values[0]}, {other} {values[1]}', 'one of the two', remedy)
 
     def _grip(self, chain: Chain, point: int | None, fraction: float | None) -> tuple[int, float]:
         """Return the gripped point, from 0, and the offset from it; given by an index or by a fraction."""
@@ -123,7 +119,7 @@ class _OneHand(NamedAction):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require_one('point', 'fraction', 'say where the hand grips')
+        self._require_either('point', 'fraction', 'say where the hand grips')
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the path of the hand at constant speed, without repeated waypoints."""
@@ -184,7 +180,7 @@ class GraspAndPlace(_Carrying):
     """
     Lift a point, carry it through the air, put it down and open.
 
-    The hand rises to `height` above the higher one of the two places, moves across, and down to the target.
+    The hand rises to `height` above the higher of the two places, moves across, and down to the target.
 
     flexibility: some, together with friction: near the placed point, those bends stay that friction can hold
         against the bending stiffness.
@@ -196,6 +192,8 @@ class GraspAndPlace(_Carrying):
     """
 
     height: float = 0.05
+
+    name = 'grasp_and_place'
 
     def _way(self, point: Floats) -> Sequence[Floats]:
         target = self._target(point)
@@ -215,6 +213,8 @@ class Drag(_Carrying):
         along the DLO shows some of friction alone. With fast hands, inertia matters too.
     self_collision: nothing, unless the DLO is dragged against itself.
     """
+
+    name = 'drag'
 
     def _way(self, point: Floats) -> Sequence[Floats]:
         return [self._target(point)]
@@ -237,6 +237,8 @@ class LiftAndHold(_OneHand):
 
     height: float = 0.1
     hold: bool = True
+
+    name = 'lift_and_hold'
 
     def _way(self, point: Floats) -> Sequence[Floats]:
         return [point + self.height * UP]
@@ -261,6 +263,8 @@ class PushDown(_OneHand):
 
     distance: float = 0.05
     hold: bool = True
+
+    name = 'push_down'
 
     def _way(self, point: Floats) -> Sequence[Floats]:
         return [point - self.distance * UP]
@@ -301,23 +305,23 @@ class TwoHands(NamedAction):
     hands: tuple[str, ...] = ('left_hand', 'right_hand')
     hold: bool = True
 
+    name = 'two_hands'
     may_be_flat: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require_one('points', 'fractions', 'say where the hands grip')
+        self._require_either('points', 'fractions', 'say where the hands grip')
         for name, values in (('points or fractions', self.points or self.fractions or ()),
                              ('hands', self.hands)):
             if len(values) != 2:
                 raise self._refused(f'{len(values)} {name}', '2', 'give one for each hand')
         if self.fractions is not None:
-            object.__setattr__(self, 'fractions', tuple(float(one) for one in self.fractions))
-        if self.motion not in ('apart', 'together'):
-            raise self._refused(f'motion {self.motion!r}', 'apart or together',
-                                meant(self.motion, ('apart', 'together'), 'correct the action'))
-        if self.moving not in MOVING:
-            raise self._refused(f'moving {self.moving!r}', one_of(MOVING, self.moving),
-                                meant(self.moving, MOVING, 'correct the action'))
+            object.__setattr__(self, 'fractions', tuple(map(float, self.fractions)))
+        for name, value, known in (('motion', self.motion, ('apart', 'together')),
+                                   ('moving', self.moving, tuple(MOVING))):
+            if value not in known:
+                raise self._refused(f'{name} {value!r}', one_of(known, value),
+                                    suggestion(value, known, 'correct the action'))
 
     def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
         """Return the paths of both hands, whose waypoints have the same times."""
@@ -343,7 +347,7 @@ class TwoHands(NamedAction):
             if length > 0:
                 way.append(target)
                 times.append(times[-1] + length / self.speed)
-        return Action(tuple(Hand(name, (grips[k][0],), np.array(times), np.array([one[k] for one in way]),
+        return Action(tuple(Hand(name, (grips[k][0],), np.array(times), np.array(way)[:, k],
                                  offset=grips[k][1]) for k, name in enumerate(self.hands)))
 
 
@@ -363,6 +367,8 @@ class Release(NamedAction):
     """
 
     hands: tuple[str, ...] = ('left_hand',)
+
+    name = 'release'
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -386,12 +392,153 @@ class Release(NamedAction):
         return Action(tuple(opened))
 
 
-#: Name of the element in a request -> class.
 NAMED_ACTIONS: Mapping[str, type[NamedAction]] = {
-    'grasp_and_place': GraspAndPlace,
-    'drag': Drag,
-    'lift_and_hold': LiftAndHold,
-    'push_down': PushDown,
-    'two_hands': TwoHands,
-    'release': Release,
-}
+    kind.name: kind for kind in (GraspAndPlace, Drag, LiftAndHold, PushDown, TwoHands, Release)}
+
+MOST_STEPS = 200  # of a manipulation; each named action simulates all actions before it again
+
+
+@dataclass(frozen=True)
+class SimultaneousActions:
+    """
+    Actions of different hands that overlap in time.
+
+    :param actions: one or more; their starts count from one clock.
+    :param held_by: names of the hands that hold the DLO afterwards.
+    """
+
+    actions: tuple[Union[NamedAction, Action], ...]
+    held_by: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the action, or of all of them; explicit paths of hands are called `hand_paths`."""
+        return ' and '.join(dict.fromkeys(action.name for action in self.actions))
+
+
+@dataclass(frozen=True)
+class Manipulation:
+    """
+    A DLO at rest, and the actions to do with it in turn.
+
+    :param start: the DLO before the first action.
+    :param steps: one or more, at most MOST_STEPS; each begins when the DLO rests after the one before.
+    :param warnings: sentences for the user: what differs from the request or the recording.
+    """
+
+    name: str
+    start: Chain
+    steps: tuple[SimultaneousActions, ...]
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        thing = f'trial {self.name!r}'
+        if not self.steps:
+            raise InputError(thing, 'no action', 'at least one', 'say what the hands do')
+        if len(self.steps) > MOST_STEPS:
+            raise InputError(thing, f'{len(self.steps)} actions in turn', f'at most {MOST_STEPS}',
+                             'divide it into several trials')
+        check_ends(thing, self.start)
+        check_grips(thing, [hand for step in self.steps for action in step.actions
+                            if isinstance(action, Action) for hand in action.hands], len(self.start))
+
+
+@dataclass(frozen=True)
+class TimedAction:
+    """
+    An action with its time.
+
+    :param end: when the last hand arrives [s].
+    :param hold: whether its hands hold the DLO afterwards, if no observation shows it.
+    """
+
+    action: Union[NamedAction, Action]
+    end: float
+    hold: bool
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of its hands."""
+        return frozenset(self.action.hand_names)
+
+
+def manipulation_of(name: str, start: Chain, actions: Iterable[TimedAction],
+                    holding: Sequence[tuple[float, Sequence[str] | None]] = ()) -> Manipulation:
+    """
+    Return the manipulation with actions of one clock.
+
+    Actions of different hands that overlap in time are one step.
+
+    :param holding: times [s] of observations in order, and the names of the hands that hold the DLO then;
+        None: those that still hold it after their actions.
+    """
+    groups: list[list[TimedAction]] = []
+    warnings = []
+    for timed in sorted(actions, key=lambda timed: timed.action.start):
+        group, begin = groups[-1] if groups else [], timed.action.start
+        busy = frozenset().union(*(other.names for other in group)) & timed.names
+        if group and begin < max(other.end for other in group):
+            if not busy:
+                group.append(timed)
+                continue
+            if begin > group[0].action.start:
+                warnings.append(f'trial {name!r}: {", ".join(sorted(busy))} acts again at '
+                                f'{begin:g} s, while another hand moves; it is simulated afterwards')
+        groups.append([timed])
+    held: dict[str, None] = {}  # in the order in which they closed
+    steps = []
+    for k, group in enumerate(groups):
+        acting = {hand: timed.hold for timed in group for hand in sorted(timed.names)}
+        held = {hand: None for hand in (*held, *acting) if acting.get(hand, True)}
+        until = groups[k + 1][0].action.start if k + 1 < len(groups) else np.inf
+        end = max(timed.end for timed in group)
+        observed = [hands for time, hands in holding if end < time <= until]
+        if observed and observed[-1] is not None:
+            held = dict.fromkeys(observed[-1])
+        steps.append(SimultaneousActions(tuple(timed.action for timed in group), tuple(held)))
+    return Manipulation(name, start, tuple(steps), tuple(warnings))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedPaths(NamedAction):
+    """
+    Explicit paths of hands; where a hand grips can depend on the chain before.
+
+    :param hands: their h names.
+    :param grips: for each hand, the points that it grips; empty: the place nearest to where it closes.
+    :param times: (k,) [s] since `start`, increasing.
+    :param positions: (k, h, 3) [m].
+    :param orientations: (k, h, 4) quaternions x y z w.
+    :param tolerance: largest distance of a hand that closes from the nearest place [m].
+    """
+
+    hands: tuple[str, ...]
+    grips: tuple[tuple[int, ...], ...]
+    times: Floats
+    positions: Floats
+    orientations: Floats
+    tolerance: float
+
+    name = PATHS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ('times', 'positions', 'orientations'):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+    def action(self, chain: Chain, before: Sequence[Action] = ()) -> Action:
+        """Return the paths, whose hands grip points of this chain."""
+        hands = []
+        for k, (name, grips) in enumerate(zip(self.hands, self.grips, strict=True)):
+            offset = 0.0
+            if not grips:
+                point, offset, distance = chain.nearest(self.positions[0, k])
+                grips = (point,)
+                if distance > self.tolerance:
+                    raise self._refused(
+                        f'{name} closing {distance:.4g} m from any point of the predicted chain',
+                        f'at most {self.tolerance:g} m (grip_tolerance)',
+                        'check the first waypoint, or record the chain before this action')
+            hands.append(Hand(name, grips, self.start + self.times, self.positions[:, k],
+                              self.orientations[:, k], offset))
+        return Action(tuple(hands))

@@ -6,21 +6,63 @@ Parameters: their values on the paper's scale from 0 to 100, and their physical 
 
 The package computes in SI units; the scale from 0 to 100 exists here and at the
 edges (messages, files, tables).  A new parameter is one more entry of PARAMETERS;
-an engine reads its physical value by name.
+an engine reads its physical value by name.  The formulas at the end say what the parameters of bending
+mean for a piece of DLO: the shape that nothing bends, and the moment that bends it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.errors import InputError, meant
+from dlo_calibration.errors import InputError, suggestion
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.quantity import interval, measured
+
+
+def exact(value: Any) -> str:
+    """Return a value as text from which a program reads it back exactly."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, (tuple, list)):
+        return ' '.join(map(exact, value))
+    return str(value) if isinstance(value, (int, str)) else repr(float(value))
+
+
+def number(value: float | None) -> str:
+    """
+    Return a number with three significant digits, for people; a dash where it is unknown.
+
+    Only a very large or very small number has a power of ten.
+    """
+    if value is None or not math.isfinite(value):
+        return '-'
+    if value == 0:
+        return '0'  # -0.0, too
+    if 1e-5 <= abs(value) < 1e6:
+        return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim='-')
+    return f'{value:.3g}'
+
+
+def measured(value: float | None, unit: str) -> str:
+    """Return a physical value (SI) with its unit, for people: lengths in mm, coefficients without unit."""
+    return _with_unit([value], unit)
+
+
+def interval(lower: float | None, upper: float | None, unit: str) -> str:
+    """Return both ends of an interval (SI) with their unit, as `measured` writes one value."""
+    return _with_unit([lower, upper], unit)
+
+
+def _with_unit(values: Sequence[float | None], unit: str) -> str:
+    if unit == 'm':
+        values, unit = [None if value is None else 1e3 * value for value in values], 'mm'
+    text = ' to '.join(map(number, values))
+    return text if unit == '1' else f'{text} {unit}'
+
 
 SCALE = 100.0  # the upper end of the paper's scale
 GRAVITY = 9.81  # m/s^2
@@ -35,7 +77,7 @@ class Parameter:
 
     :param at_zero: physical value at 0.
     :param at_hundred: physical value at 100.
-    :param default: value on the 0..100 scale of a parameter that is neither found nor fixed.
+    :param default: value on the 0..100 scale of a parameter that is neither calibrated nor fixed.
     :param linear: True for a linear scale, False for a logarithmic one.
     :param neutral: exact physical value at the default, where the parameter has no effect
         there: 1 for a ratio, or 0, which a logarithmic scale does not contain.
@@ -170,7 +212,7 @@ class ParameterSpace:
         for name in (*free, *self.fixed):
             if name not in BY_NAME:
                 raise InputError('parameter', repr(name), f'one of {", ".join(BY_NAME)}',
-                                 meant(name, BY_NAME, 'correct the name'))
+                                 suggestion(name, BY_NAME, 'correct the name'))
         if not free or len(set(free)) < len(free):
             raise InputError('calibrate', str(list(free)), 'one or more different names',
                              'name each parameter to find once')
@@ -256,7 +298,7 @@ class ParameterSpace:
 
     @property
     def mass_known(self) -> bool:
-        """Tell whether physical values can be given in absolute units."""
+        """Return whether physical values can be given in absolute units."""
         return self.mass > 0 or 'mass' in self.free or 'mass' in self.fixed
 
     def values(self, point: Sequence[float] | Floats) -> dict[str, float]:
@@ -296,3 +338,69 @@ class ParameterSpace:
         if parameter.per_weight and not self.mass_known:
             return physical / (ASSUMED_DENSITY * GRAVITY), f'{parameter.unit} {PER_WEIGHT}'
         return physical, parameter.unit
+
+
+def natural_curvature(physical: Mapping[str, float], fractions: Floats) -> Floats:
+    """
+    Return the (m, 2) components [1/m] of the curvature of the rest shape, in the material frame.
+
+    :param physical: physical values by parameter name, in SI units.
+    :param fractions: (m,) of the length, 0 to 1.
+    """
+    curvature = np.zeros((len(fractions), 2))
+    curvature[:, 0] = physical.get('natural_curvature', 0.0)
+    known = [physical[name] for name in knot_names(KNOTS[-1]) if name in physical]
+    for axis in range(2 if known else 0):
+        values = known[axis::2]
+        curvature[:, axis] += np.interp(fractions, np.linspace(0, 1, len(values)), values)
+    return curvature
+
+
+def rest_shape(curvatures: Floats, length: float) -> Floats:
+    """
+    Return the shapes (..., m + 2, 3) [m] that begin in the origin and lead along x.
+
+    The material frame is not twisted, so that it turns about ``t x k`` from segment to segment (Bishop, There
+    is more than one way to frame a curve, 1975).
+
+    :param curvatures: (..., m, 2) [1/m] at the joints of m + 1 equal segments.
+    :param length: [m].
+    """
+    step = length / (curvatures.shape[-2] + 1)
+    frame = np.broadcast_to(np.eye(3), (*curvatures.shape[:-2], 3, 3))  # columns: tangent, two across it
+    tangents = [frame[..., 0]]
+    for k in range(curvatures.shape[-2]):
+        first, second = curvatures[..., k, 0] * step, curvatures[..., k, 1] * step
+        angle = np.hypot(first, second)
+        along = np.stack([np.cos(angle), np.sinc(angle / np.pi) * first,
+                          np.sinc(angle / np.pi) * second], axis=-1)
+        # The smallest rotation from the x axis to `along`, of the frame's own axes.
+        x, y, z = np.moveaxis(along, -1, 0)
+        rest = 1 / np.maximum(1 + x, 1e-9)
+        turn = np.stack([np.stack([x, -y, -z], axis=-1),
+                         np.stack([y, 1 - y * y * rest, -y * z * rest], axis=-1),
+                         np.stack([z, -y * z * rest, 1 - z * z * rest], axis=-1)], axis=-2)
+        frame = frame @ turn
+        tangents.append(frame[..., 0])
+    steps = np.stack([np.zeros_like(tangents[0]), *tangents], axis=-2) * step
+    return np.asarray(steps.cumsum(axis=-2))
+
+
+def bending_moments(curvatures: Floats, stiffness: float, friction: float, slip: float) -> Floats:
+    """
+    Return the (m,) moments [N m] while a piece of DLO is bent in one plane.
+
+    Strands that rub on each other are an elastic, perfectly plastic element beside the elastic bending (Iwan,
+    A distributed-element model for hysteresis, 1966).  So each branch of a cycle is the first one, twice as
+    large (Masing, 1926), and a cycle between -a and a takes the energy ``4 EI friction (a - slip)`` of each
+    metre if a is larger than `slip`, and none if it is smaller.
+
+    :param curvatures: (m,) [1/m], from that of the rest shape; at the first, the strands are free of stress.
+    :param stiffness: EI [N m^2].
+    :param friction: largest moment of the friction between strands, relative to EI [1/m].
+    :param slip: change of curvature at which they slip [1/m].
+    """
+    stress = np.zeros(len(curvatures))
+    for k, change in enumerate(np.diff(curvatures), start=1):
+        stress[k] = np.clip(stress[k - 1] + friction / slip * change, -friction, friction)
+    return stiffness * (curvatures + stress)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pose: position and orientation of one frame in another, and what it does to points and quaternions."""
+"""Pose: position and orientation of a frame in another; it transforms points, quaternions and trials."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Action, far_from_unit, Hand, quaternion_lengths
+from dlo_calibration.model.action import Action, far_from_unit, Hand, quaternion_lengths, rotation_matrix
 from dlo_calibration.model.chain import Chain, check_size, Floats, frozen_array
 from dlo_calibration.model.named_actions import NamedAction
 from dlo_calibration.model.trial import Trial
@@ -37,7 +37,7 @@ class Pose:
         check_size('frame_pose', 'position', position[None, :])
         length = quaternion_lengths(orientation)
         if not (np.isfinite(position).all() and np.isfinite(length)) or bool(far_from_unit(length)):
-            raise InputError('frame_pose', ' '.join(f'{one:g}' for one in (*position, *orientation)),
+            raise InputError('frame_pose', ' '.join(f'{number:g}' for number in (*position, *orientation)),
                              f'finite numbers {NUMBERS} with a unit quaternion', 'correct it')
         object.__setattr__(self, 'position', position)
         object.__setattr__(self, 'orientation', frozen_array(orientation / length))
@@ -59,15 +59,12 @@ class Pose:
         return cls(np.array(numbers[:3]), np.array(numbers[3:]))
 
     def __str__(self) -> str:
-        return ' '.join(repr(one) for one in (*self.position.tolist(), *self.orientation.tolist()))
+        return ' '.join(map(repr, (*self.position.tolist(), *self.orientation.tolist())))
 
     @cached_property
     def rotation(self) -> Floats:
         """(3, 3) rotation matrix."""
-        x, y, z, w = self.orientation
-        return frozen_array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+        return frozen_array(rotation_matrix(self.orientation))
 
     @property
     def inverse(self) -> Pose:
@@ -105,7 +102,7 @@ class Pose:
                                  self.orientations(hand.orientations), hand.offset) for hand in action.hands))
 
     def named_action(self, action: NamedAction) -> NamedAction:
-        """Return a named action of the frame, to be done in the other one, whose z is then up."""
+        """Return a named action of the frame for the other one, whose z is up."""
         moved: dict[str, Any] = {
             name: tuple(move(np.array(given)).tolist())
             for name, move in (('to', self.points), ('direction', self.vectors))

@@ -30,9 +30,9 @@ def focal_points(trial: Trial) -> NDArray[np.intp]:
     for name in dict.fromkeys(hand.name for hand in hands):
         paths = [hand for hand in hands if hand.name == name]
         latest = np.searchsorted([path.start for path in paths], times, side='right') - 1
-        kept = np.array([name in goal.held_by for goal in trial.goals])
+        holding = np.array([name in goal.held_by for goal in trial.goals])
         for k, path in enumerate(paths):
-            rows = np.flatnonzero((latest == k) & (kept | (times <= path.end)))
+            rows = np.flatnonzero((latest == k) & (holding | (times <= path.end)))
             away = np.linalg.norm(points[rows] - path.positions_at(times[rows])[:, None], axis=2)
             away[~seen[rows]] = np.inf
             nearer = away.min(axis=1) < nearest[rows]
@@ -98,7 +98,7 @@ def difference_vector(goal: Floats, current: Floats, reference: int,
 
 class TrialScore:
     """
-    The difference score and the residuals of one trial; the terms of its goals are computed once.
+    The difference score of one trial; the terms of its goals are computed once.
 
     Points of goals that were not seen are left out of all sums.
     """
@@ -124,11 +124,6 @@ class TrialScore:
         place = np.einsum('gi,gij->gj', self._features, np.abs(self._points - chains))
         difference = self._shape - self._extent(chains) + place
         return float(np.linalg.norm(difference, axis=1).mean()) * 100
-
-    def residuals(self, chains: Floats) -> Floats:
-        """Return simulated minus observed coordinates of the p seen points, (3 p,) [m], goal by goal."""
-        away = np.asarray(chains - self._points)
-        return (away if self._seen is None else away[self._seen]).ravel()
 
 
 def differences(trial: Trial, chains: Floats) -> Floats:

@@ -5,16 +5,19 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
+import math
 from typing import Sequence
 
 import numpy as np
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.model.action import Action, Hand, MAXIMUM_TIME
+from dlo_calibration.model.action import Action, check_grips, Hand, MAXIMUM_TIME
 from dlo_calibration.model.chain import Chain, check_ends, Floats, frozen_array
 
-VIEWS = 25  # goals, evenly spread, that tell where unseen points of an initial chain are
+VIEWS = 25  # goals, evenly spread, from which the places of unseen points of an initial chain are estimated
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Trial:
     One observed manipulation: the DLO before it, the actions of the hands, and the observed goals.
 
     :param initial: the DLO before the action; point i is the same material point in all chains. Where
-        points of it were not seen, the goals that show them tell how far along the DLO they are.
+        points of it were not seen, their arc lengths come from the goals that show them.
     :param actions: one or more, in the order of their start.
     :param goals: one or more, in the order of their time.
     :param velocity: (n, 3) [m/s] of the initial points; None: the DLO is at rest.
@@ -76,16 +79,14 @@ class Trial:
                 raise InputError(
                     thing, f'a goal of {len(goal.chain)} points', f'{n} points as in the initial chain',
                     'resample both chains to the same material points')
-        for action in actions:
-            for hand in action.hands:
-                moving = [goal for goal in goals if goal.stable and hand.start < goal.time < hand.end]
-                if moving:
-                    raise InputError(
-                        thing, f'a stable goal at {moving[0].time:g} s, while hand {hand.name!r} moves',
-                        'a goal after its last waypoint', 'make it a timed goal')
-                if not all(0 <= grip < n for grip in hand.grips):
-                    raise InputError(thing, f'hand {hand.name!r} gripping points {hand.grips}',
-                                     f'points 0 to {n - 1}', 'correct the gripped points')
+        hands = [hand for action in actions for hand in action.hands]
+        stable = [*(goal.time for goal in goals if goal.stable), math.inf]
+        for hand in hands:
+            time = stable[bisect_right(stable, hand.start)]
+            if time < hand.end:
+                raise InputError(thing, f'a stable goal at {time:g} s, while hand {hand.name!r} moves',
+                                 'a goal after its last waypoint', 'make it a timed goal')
+        check_grips(thing, hands, n)
         check_ends(thing, self.initial)
         object.__setattr__(self, 'actions', actions)
         object.__setattr__(self, 'goals', goals)
@@ -106,7 +107,7 @@ class Trial:
                                  'give one for each point')
             object.__setattr__(self, 'places', places)
 
-    @property
+    @cached_property
     def hands(self) -> tuple[Hand, ...]:
         """All hands of all actions, in the order of their start."""
         return tuple(sorted((hand for action in self.actions for hand in action.hands),
@@ -132,12 +133,12 @@ class Trial:
             if hand.start > self.hands[0].start or hand.start > 0 and self.velocity is not None \
                     or hand.offset or (hand.orientations != hand.orientations[0]).any():
                 continue
-            held = [goal for goal in self.goals if any(hand is one for one in self.holding(goal))]
+            held = [goal for goal in self.goals if any(hand is other for other in self.holding(goal))]
             for grip in hand.grips:
-                apart = [goal.chain.points[grip] - hand.positions_at(np.array([goal.time]))[0]
+                offsets = [goal.chain.points[grip] - hand.positions_at(np.array([goal.time]))[0]
                          for goal in held if goal.chain.seen[grip]]
-                if apart and not self.initial.seen[grip]:
-                    places[grip] = hand.positions[0] + np.mean(apart, axis=0)
+                if offsets and not self.initial.seen[grip]:
+                    places[grip] = hand.positions[0] + np.mean(offsets, axis=0)
         return places
 
     def holding(self, goal: Goal) -> tuple[Hand, ...]:
@@ -146,7 +147,7 @@ class Trial:
         return tuple(hand for hand in last.values() if self.holds(hand, goal))
 
     def holds(self, hand: Hand, goal: Goal) -> bool:
-        """Tell whether `hand`, or a later path of the same name, holds the DLO when `goal` is observed."""
+        """Return whether `hand`, or a later path of the same name, holds the DLO when `goal` is observed."""
         if goal.time <= hand.end:
             return goal.time >= hand.start
         return hand.name in goal.held_by

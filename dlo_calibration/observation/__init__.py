@@ -5,9 +5,9 @@
 
 from dlo_calibration.observation.estimate import prior_estimates, PriorEstimate
 from dlo_calibration.observation.excitation import excites
+from dlo_calibration.observation.material import with_shared_places
 from dlo_calibration.observation.noise import smooth
 from dlo_calibration.observation.plausibility import implausible, implausible_trials
-from dlo_calibration.observation.rest_lengths import with_shared_places
 from dlo_calibration.observation.table import resting_level
 
 __all__ = ['PriorEstimate', 'excites', 'implausible', 'implausible_trials', 'prior_estimates',

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -22,47 +21,38 @@ STILL = 0.005  # m/s; a slower hand or DLO rests
 TURNING = 0.05  # rad/s; a hand that turns more slowly rests
 
 
-@dataclass(frozen=True)
-class Motions:
+def motions(trials: Sequence[Trial]) -> tuple[bool, bool]:
     """
-    What the timed goals of trials show.
+    Return whether timed goals show a motion, and one between clamps; hands and DLO that wait show none.
 
-    :param seen: whether hands or DLO move in one of them.
-    :param between_clamps: whether two hands or more clamp the DLO meanwhile.
+    A motion is between clamps if two hands or more clamp the DLO meanwhile.
     """
-
-    seen: bool = False
-    between_clamps: bool = False
-
-
-def motions(trials: Sequence[Trial]) -> Motions:
-    """Return what the timed goals of trials show; a goal while hands and DLO wait shows no motion."""
     moving: list[tuple[Trial, Goal]] = []
     for trial in trials:
         goals = [goal for goal in trial.goals if not goal.stable]
-        found = [(trial, goal) for goal, moves in zip(goals, _moves(trial, goals), strict=True) if moves]
-        if any(map(_clamped, found)):
-            return Motions(True, True)
-        moving += found
+        shown = [(trial, goal) for goal, moves in zip(goals, _moves(trial, goals), strict=True) if moves]
+        if any(map(_clamped, shown)):
+            return True, True
+        moving += shown
     moving = moving or _swinging(trials)
-    return Motions(bool(moving), any(map(_clamped, moving)))
+    return bool(moving), any(map(_clamped, moving))
 
 
 def _clamped(seen: tuple[Trial, Goal]) -> bool:
-    """Tell whether two hands or more clamp the DLO of a trial in a goal."""
+    """Return whether two hands or more clamp the DLO of a trial in a goal."""
     trial, goal = seen
     return sum(len(hand.grips) > 1 for hand in trial.holding(goal)) > 1
 
 
 def _moves(trial: Trial, goals: Sequence[Goal]) -> NDArray[np.bool_]:
     """
-    Tell of each timed goal whether it surely shows a motion, (g,).
+    Return which timed goals certainly show a motion, (g,).
 
-    It does where a hand moves, where the DLO was moving when the trial began, and where no hand is under way:
-    whoever observes the DLO in motion then makes the goal a timed one.
+    They do if a hand moves, if the DLO was moving when the trial began, and if no hand is under way: such a
+    goal is timed because the DLO was seen in motion.
     """
     times = np.array([goal.time for goal in goals])
-    found = np.full(len(goals), trial.velocity is not None)
+    moving = np.full(len(goals), trial.velocity is not None)
     waiting = np.zeros(len(goals), np.bool_)
     for hand in trial.hands if len(goals) else ():
         (place, turn), (place_after, turn_after) = (hand.poses(times + k * NEAR / 2) for k in (-1, 1))
@@ -70,33 +60,33 @@ def _moves(trial: Trial, goals: Sequence[Goal]) -> NDArray[np.bool_]:
         # The Frobenius distance of two rotations is 2 sqrt(2) sin(angle / 2).
         angles = np.linalg.norm(turn_after - turn, axis=(1, 2)) / np.sqrt(2)
         under_way = (hand.start <= times) & (times <= hand.end)
-        found |= under_way & ((ways > STILL * NEAR) | (angles > TURNING * NEAR))
+        moving |= under_way & ((ways > STILL * NEAR) | (angles > TURNING * NEAR))
         waiting |= under_way
-    return found | ~waiting
+    return moving | ~waiting
 
 
 def _swinging(trials: Sequence[Trial]) -> list[tuple[Trial, Goal]]:
-    """Return the timed goals that differ from the next one, shortly after, by more than noise explains."""
-    pairs = [(trial, one, other) for trial in trials
-             for one, other in zip(trial.goals[:-1], trial.goals[1:], strict=True)
-             if not one.stable and 0 < other.time - one.time <= NEAR]
+    """Return the timed goals that differ from the next goal, shortly after, by more than noise explains."""
+    pairs = [(trial, goal, later) for trial in trials
+             for goal, later in zip(trial.goals[:-1], trial.goals[1:], strict=True)
+             if not goal.stable and 0 < later.time - goal.time <= NEAR]
     if not pairs:
         return []
     sigma = np.nan_to_num(noise(trials))
-    return [(trial, one) for trial, one, other in pairs
-            if _apart(one.chain, other.chain) > 4 * sigma + STILL * (other.time - one.time)]
+    return [(trial, goal) for trial, goal, later in pairs
+            if _apart(goal.chain, later.chain) > 4 * sigma + STILL * (later.time - goal.time)]
 
 
-def _apart(one: Chain, other: Chain) -> float:
+def _apart(chain: Chain, other: Chain) -> float:
     """Return the root mean square of how far the coordinates that both chains show moved [m]."""
-    both = one.seen & other.seen
-    return float(np.sqrt(np.mean((other.points - one.points)[both]**2))) if both.any() else 0.0
+    both = chain.seen & other.seen
+    return float(np.sqrt(np.mean((other.points - chain.points)[both]**2))) if both.any() else 0.0
 
 
 def excites(trials: Sequence[Trial], space: ParameterSpace, table_height: float | None
             ) -> NDArray[np.bool_]:
     """
-    Return which free parameters each trial can show, (T, d); False only where it surely cannot.
+    Return which free parameters each trial can show, (T, d); False only if it certainly cannot.
 
     :param table_height: [m]; None where there is no table.
     """
@@ -119,7 +109,7 @@ def _chains(trial: Trial) -> list[Floats]:
 
 
 def _may_touch_table(trial: Trial, table_height: float | None) -> bool:
-    """Tell whether the DLO may touch the table: it hangs low, or hands move it far."""
+    """Return whether the DLO may touch the table: it hangs low, or hands move it far."""
     if table_height is None:
         return False
     lowest = min(float(points[:, 2].min()) for points in _chains(trial))
@@ -130,7 +120,7 @@ def _may_touch_table(trial: Trial, table_height: float | None) -> bool:
 
 def _may_touch_itself(trial: Trial) -> bool:
     """
-    Tell whether parts that are not neighbours may have touched.
+    Return whether parts that are not neighbours may have touched.
 
     It checks the observed chains, chains interpolated between them, and the path of each hand past them.
     """
@@ -159,7 +149,7 @@ def _may_touch_itself(trial: Trial) -> bool:
 
 
 def _may_stretch(trial: Trial, space: ParameterSpace, sigma: float) -> bool:
-    """Tell whether the hands may have stretched a DLO of the greatest elasticity measurably."""
+    """Return whether the hands may have stretched a DLO of the greatest elasticity measurably."""
     hands, length = trial.hands, trial.initial.length
     places = trial.initial.arc_lengths()
     for k, hand in enumerate(hands):

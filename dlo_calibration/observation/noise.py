@@ -12,12 +12,12 @@ import numpy as np
 
 from dlo_calibration.model.chain import Chain, Floats
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.rest import STREAM
 
 ORDERS = range(2, 9)  # of the differences; higher orders do not separate curve and noise any better
 SMOOTHING = np.logspace(-8, 8, 161)  # candidate weights of the roughness
 NO_NOISE = 1e-6  # m; removing a smaller noise moves no point visibly
 KINK = 8.0  # times the median square; 99.9 % of the squares of white noise in space are below
-STREAM = 12  # views of the DLO from which on a trial shows its noise over time, too
 SLOW, SLOW_SIGMAS = 0.25, -0.6745  # share of the instants that count as slow; the normal quantile of it
 
 
@@ -35,7 +35,7 @@ def noise(trials: Sequence[Trial]) -> float:
     for streamed in (False, True):
         some = [trial for trial in trials if _is_stream(trial) == streamed]
         if some:
-            along = noise_of([np.stack([one.observed for one in (
+            along = noise_of([np.stack([chain.observed for chain in (
                 trial.initial, *(goal.chain for goal in trial.goals if goal.count == 1))]) for trial in some])
             level = np.fmin(along, _noise_over_time(some)) if streamed else along
             levels += [float(level)] * len(some)
@@ -59,7 +59,7 @@ def _views(trial: Trial) -> tuple[Floats, Floats]:
 
 
 def _is_stream(trial: Trial) -> bool:
-    """Tell whether a trial shows the DLO often enough for differences over time."""
+    """Return whether a trial shows the DLO often enough for differences over time."""
     return len(trial.goals) >= STREAM and len(_views(trial)[0]) >= STREAM
 
 
@@ -88,7 +88,7 @@ def _noise_over_time(trials: Sequence[Trial]) -> float:
             spread = 2 / (9 * 3 * shown)
             lower = (1 - spread + SLOW_SIGMAS * np.sqrt(spread))**3
             rows.setdefault(order, []).append(np.nanmean(differences**2, axis=(1, 2)) / lower)
-    slow = [np.quantile(found, SLOW) for found in map(np.concatenate, rows.values()) if len(found)]
+    slow = [np.quantile(squares, SLOW) for squares in map(np.concatenate, rows.values()) if len(squares)]
     return float(np.sqrt(min(slow, default=np.nan)))
 
 
@@ -122,15 +122,15 @@ def _differences(places: Floats) -> dict[int, Floats]:
     """
     count = len(places)
     weights = np.eye(count)
-    found: dict[int, Floats] = {}
+    by_order: dict[int, Floats] = {}
     if count < 5:
-        return found
+        return by_order
     for order in range(1, min(ORDERS.stop, count)):
         widths = places[order:] - places[:-order]
         weights = np.diff(weights, axis=0) / widths[:, None]
         if order in ORDERS:
-            found[order] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
-    return found
+            by_order[order] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
+    return by_order
 
 
 def _squared_differences(weights: Floats, chains: Floats) -> Floats:
@@ -187,11 +187,11 @@ def with_other_noise(trials: Sequence[Trial], noise: float, count: int,
     smoothed = [smooth(trial.initial.points, noise) for trial in trials]
 
     def drawn() -> tuple[Trial, ...]:
-        found: dict[bytes, Chain] = {}
+        chains: dict[bytes, Chain] = {}
         for trial, points in zip(trials, smoothed, strict=True):
             points = points + generator.normal(0, noise, points.shape)
-            found.setdefault(trial.initial.points.tobytes(), replace(trial.initial, points=points))
-        return tuple(replace(trial, initial=found[trial.initial.points.tobytes()]) for trial in trials)
+            chains.setdefault(trial.initial.points.tobytes(), replace(trial.initial, points=points))
+        return tuple(replace(trial, initial=chains[trial.initial.points.tobytes()]) for trial in trials)
 
     return [drawn() for _ in range(count)]
 

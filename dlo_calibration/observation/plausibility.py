@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Plausibility: whether a trial can be what it is said to be, judged from its chains alone.
+Plausibility: warnings about trials that physics rules out, from their chains alone.
 
-A wrong frame or table height, an axis that is not up, millimetres instead of metres, or points that run from
-the other end would all be fitted, and the parameters would be those of another world. Only what physics rules
-out is told: a DLO at rest that nothing holds lies on the table, in a level plane; one that is held at points
-hangs so that its centre of mass is straight below them (statics of a pivoted body).
+A calibration would fit them all the same, and find wrong parameters: chains in a wrong frame or at a wrong
+table height, whose z is not up, in millimetres, or with points that run from the other end. A DLO at rest
+that nothing holds lies on the table, in a level plane; if it is held at points, its centre of mass is
+straight below them (statics of a pivoted body).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import Iterator, Sequence
 
@@ -21,7 +20,7 @@ import numpy as np
 from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.quantity import measured, number
+from dlo_calibration.model.parameters import measured, number
 from dlo_calibration.model.trial import shown_goals, Trial
 from dlo_calibration.observation.noise import noise_of
 from dlo_calibration.observation.table import HANGING, lowest_level, RESTING_BAND
@@ -32,35 +31,25 @@ BELOW = 0.01  # m; a table may be measured with such an error, and trackers see 
 SIGMAS = 5.0  # standard deviations of the noise that are never exceeded
 STEEPEST = math.radians(15.0)  # of the plane in which a DLO lies; the pose of a table is known better
 BESIDE = math.radians(60.0)  # of a centre of mass from straight below the hands that hold a DLO
-LEVER = 0.1  # of the length; a shorter one says nothing about its direction
-MOST_TRIALS = 3  # are told of in full; a wrong frame makes all trials wrong
+LEVER = 0.1  # of the length; the direction of a shorter lever is uncertain
+MOST_TRIALS = 3  # with warnings in full; a wrong frame makes all trials wrong
 SOON = 0.5  # s; between two chains with a shorter gap, no DLO turns end for end
-
-
-@dataclass(frozen=True)
-class _Rest:
-    """A chain at rest, in words, and the hands that may hold it."""
-
-    words: str
-    chain: Chain
-    hands: Sequence[Hand]
 
 
 def implausible_trials(trials: Sequence[Trial], table_height: float | None,
                        scene: bool = False) -> tuple[str, ...]:
-    """Return what cannot be right about the trials of a session, as `implausible`; of many trials, some."""
-    found = [implausible(trial, table_height, scene, before)
-             for trial, before in zip(trials, [None, *trials], strict=False)]
-    told = [each for each in found if each]
-    more = len(told) - MOST_TRIALS
-    return (*(text for each in told[:MOST_TRIALS] for text in each),
+    """Return the warnings of `implausible` about the trials of a session; of many trials, the first ones."""
+    warned = [warnings for trial, before in zip(trials, [None, *trials], strict=False)
+              if (warnings := implausible(trial, table_height, scene, before))]
+    more = len(warned) - MOST_TRIALS
+    return (*(text for warnings in warned[:MOST_TRIALS] for text in warnings),
             *[f'{more} more trial(s) are implausible'] * (more > 0))
 
 
 def implausible(trial: Trial, table_height: float | None, scene: bool = False,
                 before: Trial | None = None) -> tuple[str, ...]:
     """
-    Return what cannot be right about a trial, in sentences: what came, what was expected, and the remedy.
+    Return warnings about a trial: what came, what was expected, and the remedy.
 
     :param table_height: [m]; None: there is no table.
     :param scene: whether there are other obstacles; a DLO may then lie on them.
@@ -69,28 +58,33 @@ def implausible(trial: Trial, table_height: float | None, scene: bool = False,
     length = trial.initial.length
     if not SHORTEST <= length <= LONGEST:
         return _wrong_unit(trial, length),
-    found = list(_swapped(trial, before))
+    warnings = list(_swapped(trial, before))
     seen = [trial.initial.points, *(trial.goals[k].chain.points for k in shown_goals(len(trial.goals)))]
     sigma = noise_of([np.stack(seen)])
     margin = SIGMAS * (0.002 if math.isnan(sigma) else sigma)
-    for rest in _at_rest(trial):
-        problem = _wrong_place(rest, table_height, scene, margin)
+    for description, chain, hands in _at_rest(trial):
+        problem = _wrong_place(chain, hands, table_height, scene, margin)
         if problem is not None:
-            found.append(str(InputError(trial.name, f'{rest.words} {problem[0]}', *problem[1:])))
-            break  # the others tell the same
-    return tuple(found)
+            warnings.append(str(InputError(trial.name, f'{description} {problem[0]}', *problem[1:])))
+            break  # the warnings about the others would be the same
+    return tuple(warnings)
 
 
-def _at_rest(trial: Trial) -> Iterator[_Rest]:
-    """Yield the chains at rest that are worth a look: goals that nothing holds first, as they tell most."""
+def _at_rest(trial: Trial) -> list[tuple[str, Chain, Sequence[Hand]]]:
+    """
+    Return a description of each chain at rest, the chain, and the hands that may hold it.
+
+    Those that no hand holds are first, as most is known about them.
+    """
     shown = [trial.goals[k] for k in shown_goals(len(trial.goals))]
-    goals = [_Rest(f'a DLO at rest at {number(goal.time)} s', goal.chain, trial.holding(goal))
-             for goal in shown if goal.stable]
+    chains: list[tuple[str, Chain, Sequence[Hand]]] = [
+        (f'a DLO at rest at {number(goal.time)} s', goal.chain, trial.holding(goal))
+        for goal in shown if goal.stable]
     if trial.velocity is None:
         # Whether a hand that closes at the start has held the DLO before is not known.
-        goals.append(_Rest('a DLO that begins at rest', trial.initial,
-                           [hand for hand in trial.hands if hand.times[0] <= 0]))
-    yield from sorted(goals, key=lambda rest: len(rest.hands))
+        chains.append(('a DLO that begins at rest', trial.initial,
+                       [hand for hand in trial.hands if hand.times[0] <= 0]))
+    return sorted(chains, key=lambda rest: len(rest[2]))
 
 
 def _wrong_unit(trial: Trial, length: float) -> str:
@@ -101,25 +95,25 @@ def _wrong_unit(trial: Trial, length: float) -> str:
                           f'{SHORTEST:g} to {LONGEST:g} m', f'send the coordinates in metres: {guess}'))
 
 
-def _wrong_place(rest: _Rest, table_height: float | None, scene: bool,
+def _wrong_place(chain: Chain, hands: Sequence[Hand], table_height: float | None, scene: bool,
                  margin: float) -> tuple[str, str, str] | None:
-    """Return what is wrong with where a chain rests, what was expected and the remedy; None: nothing."""
-    z = rest.chain.points[:, 2]
-    level = lowest_level(rest.chain)
+    """Return why a chain cannot rest where it does, what was expected and the remedy; None if it can."""
+    z = chain.points[:, 2]
+    level = lowest_level(chain)
     level = float(np.quantile(z, 0.1)) if math.isinf(level) else level
     if table_height is not None and level < table_height - max(BELOW, margin):
-        tilt = _tilt(rest.chain, margin)
-        if tilt > STEEPEST and not rest.hands:
+        tilt = _tilt(chain, margin)
+        if tilt > STEEPEST and not hands:
             return _steep(tilt)
         return (f'{measured(table_height - level, "m")} below the table at {number(table_height)} m',
                 'it on the table', _height_remedy(level))
     if scene:
         return None
-    if not rest.hands:
+    if not hands:
         if table_height is None:
             return ('that nothing holds', 'a table below it, or a hand that holds it',
                     f'set table to true and table_height to {number(level)}, or tell which hands hold it')
-        tilt = _tilt(rest.chain, margin)
+        tilt = _tilt(chain, margin)
         if tilt > STEEPEST:
             return _steep(tilt)
         if level >= table_height + HANGING + margin:
@@ -127,9 +121,9 @@ def _wrong_place(rest: _Rest, table_height: float | None, scene: bool,
         return None
     if table_height is not None and z.min() < table_height + HANGING + margin:
         return None  # the table holds it, too
-    if table_height is not None and _lies_flat(rest, margin):
+    if table_height is not None and _lies_flat(chain, hands, margin):
         return _in_the_air(level, table_height)
-    aside = _beside(rest)
+    aside = _beside(chain, hands)
     if aside <= BESIDE:
         return None
     if table_height is not None and np.ptp(z) <= max(RESTING_BAND, 2 * margin):
@@ -167,25 +161,25 @@ def _tilt(chain: Chain, margin: float) -> float:
     return math.acos(min(1.0, abs(float(axes[2, 2])))) if sizes[2] < 0.2 * sizes[1] else 0.0
 
 
-def _lies_flat(rest: _Rest, margin: float) -> bool:
-    """Tell whether a chain lies: level and bent, with a single hand, so that its other end would sag."""
-    points = rest.chain.points
-    if len(rest.hands) > 1 or np.ptp(points[:, 2]) > max(RESTING_BAND, 2 * margin):
+def _lies_flat(chain: Chain, hands: Sequence[Hand], margin: float) -> bool:
+    """Return whether a chain lies: level and bent, with a single hand, so that its other end would sag."""
+    points = chain.points
+    if len(hands) > 1 or np.ptp(points[:, 2]) > max(RESTING_BAND, 2 * margin):
         return False
-    return bool(np.linalg.norm(points[-1] - points[0]) < 0.98 * rest.chain.length)
+    return bool(np.linalg.norm(points[-1] - points[0]) < 0.98 * chain.length)
 
 
-def _beside(rest: _Rest) -> float:
+def _beside(chain: Chain, hands: Sequence[Hand]) -> float:
     """
     Return the angle of the centre of mass from straight below the points that hold a chain in the air [rad].
 
     The weight must have no moment about a pin, and none about the line through two pins: there is no friction
     that could balance it. 0 where a clamp or a third hand could.
     """
-    grips = [rest.chain.gripped(hand.grips, hand.offset)[0] for hand in rest.hands if len(hand.grips) == 1]
-    if len(grips) < len(rest.hands) or len(grips) > 2:
+    grips = [chain.gripped(hand.grips, hand.offset)[0] for hand in hands if len(hand.grips) == 1]
+    if len(grips) < len(hands) or len(grips) > 2:
         return 0.0
-    points = rest.chain.points
+    points = chain.points
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     centre = steps @ (points[:-1] + points[1:]) / (2 * steps.sum())
     down, lever = np.array([0.0, 0.0, -1.0]), centre - grips[0]
@@ -196,13 +190,13 @@ def _beside(rest: _Rest) -> float:
         if np.linalg.norm(down) < 0.5:  # an axis near the vertical leaves the direction open
             return 0.0
     size = float(np.linalg.norm(lever))
-    if size < LEVER * rest.chain.length:
+    if size < LEVER * chain.length:
         return 0.0
     return math.acos(float(np.clip(lever @ down / size / np.linalg.norm(down), -1.0, 1.0)))
 
 
 def _swapped(trial: Trial, before: Trial | None) -> Iterator[str]:
-    """Yield sentences on chains whose points run from the other end than in the chain before."""
+    """Yield warnings about chains whose points run from the other end than in the chain before."""
     length, initial = trial.initial.length, trial.initial.points
     remedy = 'number the points from the same end of the DLO in all chains'
     if before is not None and len(before.initial) == len(initial) and before.goals[-1].stable:
@@ -222,18 +216,18 @@ def _swapped(trial: Trial, before: Trial | None) -> Iterator[str]:
         times.append(goal.time)
 
 
-def _apart(one: Floats, other: Floats) -> float:
-    return float(np.linalg.norm(one - other, axis=1).mean())
+def _apart(points: Floats, other: Floats) -> float:
+    return float(np.linalg.norm(points - other, axis=1).mean())
 
 
-def _reversed_fits(one: Floats, other: Floats, length: float) -> bool:
-    """Tell whether a chain is far from another, but near to it in the reversed order of points."""
-    apart = _apart(one, other)
-    return apart > 0.1 * length and _apart(one[::-1], other) < 0.2 * apart
+def _reversed_fits(points: Floats, other: Floats, length: float) -> bool:
+    """Return whether a chain is far from another, but near to it in the reversed order of points."""
+    apart = _apart(points, other)
+    return apart > 0.1 * length and _apart(points[::-1], other) < 0.2 * apart
 
 
 def _held_at_other_end(trial: Trial, time: float, points: Floats, length: float) -> bool:
-    """Tell whether the point that the last hand gripped is far from where that ended, its mirror near."""
+    """Return whether the point that the last hand gripped is far from where that ended, its mirror near."""
     finished = [hand for hand in trial.hands if hand.end <= time]
     if not finished:
         return False

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rest: from when on a tracker shows the DLO at rest after an action, where it lies then, and until when."""
+"""Rest: when a DLO comes to rest after an action, where, and until when, as a tracker shows it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 
 from dlo_calibration.model.chain import Chain, Floats
 
-OPENING = 0.1  # s after the last waypoint in which a DLO that lies still may not have been let go
-STILL = 1.0  # s without motion: until then any hand has opened, and any swing has not only turned back
-STREAM = 12  # chains from which on they are a stream; each of fewer counts as it is
-BLOCK = 4  # chains that are averaged at least, to compare them with the next ones
-AGREE = 3.0  # stable distances; a simulated DLO moves less at rest, but no tracker and table are as still
+OPENING = 0.1  # s after the last waypoint; until then a hand may not have opened, though the DLO lies still
+STILL = 1.0  # s without motion: longer than a hand takes to open, and than a swing is at its turning point
+STREAM = 12  # chains that make a stream: a goal is a block of it at rest, and noise shows over time, too
+BLOCK = 4  # chains that a block has at least
+AGREE = 3.0  # stable distances between blocks at rest; trackers and tables are less still than a simulation
 MOVED = 10.0  # stable distances from the place of rest: something has moved the DLO
-SIGMAS = 1.5  # standard deviations of the difference of two blocks that noise explains
+SIGMAS = 1.5  # standard deviations by which noise makes two blocks differ
 MEDIAN = np.pi / 2  # variance of the median of white noise, relative to that of the mean
 
 
@@ -43,8 +43,8 @@ class Stream:
     """
     The chains that were observed after one action, in blocks of one `time` each.
 
-    The DLO rests from the first block on with which all others agree for the time STILL. After `limit`, it
-    counts as resting whatever it does. A chain costs the same however many came before.
+    Rest begins at the first block with which all blocks of the next STILL seconds agree, at the latest after
+    `limit`. The cost of a chain does not depend on how many came before.
 
     :param time: [s] over which rest is measured.
     :param distance: [m] that the DLO moves at most at rest within this time.
@@ -56,11 +56,11 @@ class Stream:
         self._time, self._distance, self._limit = time, distance, limit
         self._open: list[tuple[int, float, Floats]] = []  # index, instant [s], points of each chain
         self._repeated = 0  # chains among those that repeat the one before
-        self._blocks: list[_Block] = []  # while it is open with which of them rest begins
+        self._blocks: list[_Block] = []  # until it is certain at which of them rest begins
         self._place: _Place | None = None
 
     def add(self, instant: float, chain: Chain) -> None:
-        """Take the next chain, observed at an instant [s] after the last waypoint."""
+        """Add the next chain, observed at an instant [s] after the last waypoint."""
         index, self.count = self.count, self.count + 1
         if instant < OPENING:
             return
@@ -77,14 +77,14 @@ class Stream:
             self._open.append((index, instant, chain.observed))
 
     def _is_whole(self, span: float) -> bool:
-        """Tell whether the next chain, `span` [s] after the first one of the open block, begins a new one."""
+        """Return whether the next chain, `span` [s] after the first of the open block, begins a new block."""
         different = len(self._open)
         enough = different >= BLOCK or different == 1 and self._repeated >= BLOCK
         return span >= self._time and enough or (
             span >= BLOCK * self._time and different + self._repeated >= BLOCK)
 
     def rest(self) -> Rest | None:
-        """Return where the DLO rests; None while it is not known to rest."""
+        """Return where the DLO rests; None unless it is known to rest."""
         if self._place is not None:
             return self._place.rest
         begin = next((k for k in range(len(self._blocks) - 1) if self._rests_from(k)), None)
@@ -98,7 +98,7 @@ class Stream:
         return place.rest
 
     def _rests_from(self, begin: int) -> bool:
-        """Tell whether the DLO rests from a block on, as far as the following ones tell."""
+        """Return whether all blocks so far show rest from block `begin` on."""
         first, *later = self._blocks[begin:]
         return first.instant >= self._limit or all(
             block.apart(first.median) < np.hypot(
@@ -109,14 +109,14 @@ class Stream:
 @dataclass(frozen=True)
 class _Block:
     """
-    Successive chains.
+    Successive chains, and their median.
 
-    :param first: index of the first one near the median; others show the DLO in motion, or a lost tracker.
+    :param first: index of the first chain near the median; others show motion, or a tracker that is lost.
     :param instant: of the first chain [s].
     :param size: number of those near the median.
     :param total: (n, 3) [m], the sum of their points, and `seen`, (n, 1), how many of them show each.
     :param median: (n, 3) [m]; NaN where no chain shows a point.
-    :param variance: mean square [m^2] of the distances that noise makes of its points from the true ones.
+    :param variance: of the median's points by noise [m^2]: mean square of their distances from the truth.
     """
 
     first: int
@@ -137,7 +137,7 @@ class _Block:
         # Second differences leave out uniform motion, and their median one chain that is wrong.
         bends = [_mean_square(bend) for bend in points[2:] - 2 * points[1:-1] + points[:-2]]
         square = float(np.nanmedian([0.0, *bends] if np.isnan(bends).all() else bends)) / 6
-        away = np.sqrt([_mean_square(one - median) for one in points])
+        away = np.sqrt([_mean_square(chain - median) for chain in points])
         bound = np.hypot(AGREE * distance, SIGMAS * np.sqrt(square))
         near = np.flatnonzero(away <= max(np.median(away), bound))
         return cls(chains[near[0]][0], chains[0][1], len(near), np.nansum(points[near], axis=0),
@@ -157,15 +157,15 @@ def _mean_square(differences: Floats) -> float:
 
 class _Place:
     """
-    Where a DLO rests.
+    Where a DLO rests: the mean of blocks there.
 
-    It has moved again when two blocks in a row are somewhere else. Chains of a block that is are left out.
+    Blocks measured elsewhere are discarded; after two in a row, the DLO has moved again.
     """
 
     def __init__(self, block: _Block, distance: float) -> None:
         self._first, self._distance = block.first, distance
         self._size, self._total, self._seen = block.size, block.total, block.seen
-        self._away: _Block | None = None  # the newest block, if it is somewhere else
+        self._away: _Block | None = None  # the newest block, if it was measured elsewhere
         self._moved: int | None = None
 
     @property
@@ -178,7 +178,7 @@ class _Place:
         return np.asarray(np.where(self._seen > 0, self._total / np.maximum(self._seen, 1), np.nan))
 
     def add(self, block: _Block) -> None:
-        """Take the next block."""
+        """Add the next block."""
         if self._moved is not None:
             return
         bound = np.hypot(MOVED * self._distance, SIGMAS * np.sqrt(block.variance))

@@ -13,8 +13,8 @@ from dlo_calibration.model.trial import Trial
 
 HANGING = 0.04  # m; a DLO whose lowest points are so much above the table hangs
 RESTING_BAND = 0.006  # m; points of a resting chain are at most this much above its lowest one
-STACKED = 0.0015  # m; of two strands that cross, one that is so much higher lies on the other
-RISEN = 0.25  # share of its height above the other strand from which on the upper one keeps its height
+STACKED = 0.0015  # m; the higher of two strands that cross lies on the other if it is so much higher
+RISEN = 0.25  # share of its height above the other strand above which a point of the upper strand is raised
 
 
 def resting_level(trial: Trial, table_height: float) -> float | None:
@@ -50,8 +50,8 @@ def rest_on(points: Floats, level: float) -> Floats:
 
     These are the points below the level, or above it by less than half of RESTING_BAND:
     a simulation then starts with no point inside the table, and none that falls onto it.
-    A part that lies on another part of the DLO keeps its height, also if the DLO is thin: a
-    simulation cannot know otherwise which one is above.
+    A part that lies on another part of the DLO keeps its height, even if the DLO is thin: a
+    simulation cannot know otherwise which part is above.
     """
     rested = np.array(points)
     resting = rested[:, 2] < level + RESTING_BAND / 2
@@ -77,13 +77,13 @@ def crossing_segments(points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp
         determinant = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
         s = (between[:, 0] * v[:, 1] - between[:, 1] * v[:, 0]) / determinant
         t = (between[:, 0] * u[:, 1] - between[:, 1] * u[:, 0]) / determinant
-    found = np.flatnonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1))
-    return here[found], there[found], s[found], t[found]
+    crossing = np.flatnonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1))
+    return here[crossing], there[crossing], s[crossing], t[crossing]
 
 
 def _stacked(points: Floats, level: float) -> NDArray[np.bool_]:
     """
-    Tell which (N, 3) [m] points belong to a part that lies on another part of the DLO, and rises for that.
+    Return which (N, 3) [m] points belong to a part that lies on another part of the DLO, and rises for that.
 
     It does where its segment is above one of the other's, and at least STACKED higher.
     """

@@ -10,7 +10,7 @@ What will happen, and how to get there: predictions of actions, and plans from o
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.planner import PlanProgress
-from dlo_calibration.planning.rehearsal import Job, Rehearsal, Rehearser, Step
+from dlo_calibration.planning.rehearsal import ActionStep, Rehearsal, RehearsalJob, Rehearser
 
-__all__ = ['CalibratedDlo', 'Job', 'Plan', 'PlannedAction', 'PlanProgress', 'Posterior', 'Rehearsal',
-           'Rehearser', 'Step']
+__all__ = ['ActionStep', 'CalibratedDlo', 'Plan', 'PlannedAction', 'PlanProgress', 'Posterior', 'Rehearsal',
+           'RehearsalJob', 'Rehearser']

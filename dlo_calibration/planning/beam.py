@@ -7,43 +7,83 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generator, Mapping, Protocol, Sequence, TypeVar
+from itertools import islice
+from typing import Generator, Mapping, Sequence, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dlo_calibration.model.action import Action
+from dlo_calibration.evaluation.linearisation import broyden, Differences, Linearisation
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.planning.crossings import crossings
+from dlo_calibration.model.score import difference_score, difference_vector
+from dlo_calibration.planning.limits import crossings
 from dlo_calibration.planning.moves import carrying, clash, Move
-from dlo_calibration.planning.objective import Objective
-from dlo_calibration.planning.options import PlanOptions
-from dlo_calibration.planning.refinement import Best, refine, Refinement, SHARES
-from dlo_calibration.planning.rehearsal import in_turn, Job, Rehearsal, Step
+from dlo_calibration.planning.options import PlanOptions, SCORE
+from dlo_calibration.planning.rehearsal import ActionStep, in_turn, Rehearsal, RehearsalJob
+
+REFERENCE = 0  # focal point of the score: the first point, as no hand holds the DLO at the end of a plan
+
+DIFFERENCE = 0.012  # m, step of a finite difference; friction makes smaller ones misleading
+SHARES = (0.3, 1.0, 1.5)  # of the Gauss-Newton step that are tried together
+LONGEST = 0.15  # m, of a step of one displacement
+DAMPING = 0.02  # of the mean curvature
+WORTH = 0.97  # of the squares; a step that leaves more of them ends the refinement
 
 WIDTH = 3  # sequences that are continued
-KEPT = 4  # moves after each sequence that are refined
+REFINED = 4  # moves after each sequence that are refined
 ALIKE = 0.2  # of the cost; of sequences that end nearer to each other, the better one is continued
 PRICE = 1.08  # factor on the cost that an action must save
-NEAR = 2.0  # times the cost that is enough, below which all displacements are refined together
+NEAR = 2.0  # times the tolerance; below that cost, all displacements are refined together
 TOGETHER = 3  # Gauss-Newton steps for all displacements of a sequence
-PATIENCE = 1  # actions that need not gain anything, before one that may
+PATIENCE = 1  # consecutive actions that need not gain anything
 
 Result = TypeVar('Result')
-Asking = Generator[list[Job], Sequence[Rehearsal], Result]
+Asking = Generator[list[RehearsalJob], Sequence[Rehearsal], Result]
 
 
-class Refusing(Protocol):
-    """Tells what the limits of the hands do not permit."""
+class Objective:
+    """
+    The distance of chains from a goal.
 
-    def refusal(self, action: Action) -> str:
-        """Return why the hands must not move like this; empty if they may."""
+    It is the mean distance of the points.  With `score`, the paper's difference score for each of its terms
+    is added; alone, it would forgive all differences that cancel.  Its features are the points that an
+    annotator marked, else both ends, so that the place and the orientation of the DLO count.
 
-    def entered(self, chains: Floats) -> str:
-        """Return which forbidden box (m, n, 3) chains [m] enter; empty if none."""
+    :param start: whose marked points are features, too.
+    :param kind: `points` or `score`.
+    :ivar goal: points of the goal, (n, 3) [m].
+    """
+
+    def __init__(self, start: Chain, goal: Chain, kind: str) -> None:
+        self.goal = goal.points
+        self._scored = kind == SCORE
+        marked = np.flatnonzero(start.features | goal.features)
+        self._features: NDArray[np.intp] = marked if len(marked) else np.array([0, len(goal) - 1])
+        self._terms = len(goal) + len(self._features)
+
+    def cost(self, points: Floats) -> float:
+        """Return what is minimised [m], for an (n, 3) [m] chain."""
+        return self.error(points) + (self.score(points) / 100 / self._terms if self._scored else 0.0)
+
+    def residuals(self, points: Floats) -> Floats:
+        """Return the (m,) [m] whose sum of squares is minimised in place of the cost."""
+        distances: Floats = (points - self.goal).ravel() / np.sqrt(len(points))
+        if not self._scored:
+            return distances
+        vector = difference_vector(self.goal, points, REFERENCE, self._features)
+        return np.concatenate([distances, vector / self._terms])
+
+    def error(self, points: Floats) -> float:
+        """Return the mean distance [m] of the points of an (n, 3) [m] chain from those of the goal."""
+        return float(np.linalg.norm(points - self.goal, axis=1).mean())
+
+    def score(self, points: Floats) -> float:
+        """Return the difference score [cm] of an (n, 3) [m] chain."""
+        return difference_score(self.goal, points, REFERENCE, self._features)
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class MoveSequence:
     """
     A sequence of moves, and the DLO at rest before and after each.
 
@@ -62,19 +102,19 @@ class Course:
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain after the last move; one for all that follows, as finding its noise takes its time."""
+        """The chain after the last move; it is made once, because estimating its noise takes time."""
         return Chain(self.end)
 
 
 @dataclass(frozen=True, eq=False)
 class Draft:
     """
-    Moves after a course that have not been simulated.
+    Moves after a sequence that have not been simulated.
 
     :param before: (k, n, 3) [m] where the DLO is expected before each of the k moves.
     """
 
-    base: Course
+    base: MoveSequence
     moves: tuple[Move, ...]
     before: Floats
 
@@ -91,16 +131,16 @@ class Draft:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedSequence:
     """
-    A course that was simulated at once, with the found parameters and with draws from the posterior.
+    A whole sequence, simulated with the found parameters and with draws from the posterior.
 
     :param best: with the found parameters; `drawn` with the draws.
     :param cost: mean over the draws [m].
     """
 
-    course: Course
-    steps: tuple[Step, ...]
+    sequence: MoveSequence
+    steps: tuple[ActionStep, ...]
     best: Rehearsal
     drawn: tuple[Rehearsal, ...]
     cost: float
@@ -115,31 +155,32 @@ class BeamSearch:
     reaches the goal are refined together.
 
     :param start: the DLO before the first move.
-    :param enough: cost [m] at which the goal counts as reached.
+    :param tolerance: cost [m] at which the goal counts as reached.
     :param levels: (n,) heights [m] at which the points are put down.
-    :param physical: found parameters; `draws` from the posterior (SI units).
+    :param physical: the found parameters by name (SI units); `draws` are such from the posterior.
     """
 
-    def __init__(self, start: Chain, objective: Objective, enough: float, options: PlanOptions,
-                 limits: Refusing, levels: Floats, physical: Mapping[str, float],
-                 draws: Sequence[Mapping[str, float]]) -> None:
+    def __init__(self, start: Chain, objective: Objective, tolerance: float, options: PlanOptions,
+                 levels: Floats, physical: Mapping[str, float], draws: Sequence[Mapping[str, float]]
+                 ) -> None:
         self._start = start
-        self._objective, self._enough, self._options, self._limits = objective, enough, options, limits
+        self._objective, self._tolerance, self._options = objective, tolerance, options
+        self._limits = options.limits
         self._levels, self._physical, self._draws = levels, physical, draws
         self._crossings = max(crossings(start.points), crossings(objective.goal))
-        self._root = Course((), start.points[None], objective.cost(start.points))
-        self.best: Course = self._root  # the sequence that gets nearest with the found parameters, so far
+        self._root = MoveSequence((), start.points[None], objective.cost(start.points))
+        self.best: MoveSequence = self._root  # the one that gets nearest with the found parameters, so far
         self.actions = 0  # of the sequences that are tried now
-        self.judged: Judged | None = None  # the best one that was simulated with draws
+        self.judged: JudgedSequence | None = None  # the best one that was simulated with draws
         self.refusals: dict[str, int] = {}  # why moves were refused -> how often
-        self._watched = bool(options.no_go)  # whether the way of the DLO matters
-        self._pool: list[Course] = []  # all sequences that were kept
-        self._known: set[Course] = set()  # those that were judged
+        self._watched = bool(options.no_go)  # whether the trajectory of the DLO matters
+        self._pool: list[MoveSequence] = []  # all sequences that were refined
+        self._judged: set[MoveSequence] = set()  # those that were simulated with draws
         self.stop_reason = ''
         self._asking = self._search()
-        self._jobs: list[Job] = next(self._asking, [])
+        self._jobs: list[RehearsalJob] = next(self._asking, [])
 
-    def ask(self) -> list[Job]:
+    def ask(self) -> list[RehearsalJob]:
         """Return sequences to rehearse; none once the search has ended."""
         return self._jobs
 
@@ -151,7 +192,7 @@ class BeamSearch:
             self._jobs = []
 
     def stop(self) -> None:
-        """Ask from now on only for what the best sequence so far needs to be a plan."""
+        """End the search: ask only for what turns the best sequence so far into a plan."""
         self._asking = self._conclude('stopped')
         self._jobs = next(self._asking, [])
 
@@ -166,7 +207,7 @@ class BeamSearch:
         actions = self._options.actions
         moves = len(carrying(self._start.points, self._objective.goal, self._options.kinds,
                              self._options.hands))
-        following = moves + KEPT * (2 * self._options.hands + len(SHARES))
+        following = moves + REFINED * (2 * self._options.hands + len(SHARES))
         displacements = 2 * actions * self._options.hands
         return int(following * (1 + WIDTH * (actions - 1))
                    + actions * (displacements + TOGETHER * len(SHARES) + 1 + len(self._draws)))
@@ -194,17 +235,17 @@ class BeamSearch:
 
     @property
     def _spent(self) -> str:
-        """Why the search ended where it has tried as many actions as it may."""
+        """Why the search ended after it had tried the largest number of actions."""
         most, used = self._options.actions, 0 if self.judged is None else len(self.judged.steps)
         return f'the largest number of actions, {most}, is used up' if used == most else \
             f'further actions, up to {most} in all, save less than {1 - PRICE:.0%} of the error each'
 
     def _rank(self, cost: float, actions: int) -> tuple[bool, float]:
-        """Return what is less for a better sequence: one that reaches the goal, or is worth its actions."""
-        return cost > self._enough, cost * PRICE**actions
+        """Return a key that is lower for a better sequence: it reaches the goal, or is worth its actions."""
+        return cost > self._tolerance, cost * PRICE**actions
 
-    def _rank_of(self, course: Course) -> tuple[bool, float]:
-        return self._rank(course.cost, len(course.moves))
+    def _rank_of(self, sequence: MoveSequence) -> tuple[bool, float]:
+        return self._rank(sequence.cost, len(sequence.moves))
 
     @property
     def _judged_rank(self) -> tuple[bool, float]:
@@ -212,112 +253,101 @@ class BeamSearch:
         return self._rank_of(self._root) if self.judged is None else self._rank(
             self.judged.cost, len(self.judged.steps))
 
-    def _completed(self, beam: list[Course], last: bool) -> Asking[list[Course]]:
+    def _completed(self, beam: list[MoveSequence], last: bool) -> Asking[list[MoveSequence]]:
         """
         Refine the sequences that nearly reach the goal, and judge those that do.
 
         :param last: they cannot be continued, so they are all refined and judged.
         :returns: all sequences, best first.
         """
-        near = [course for course in beam if last or course.cost < NEAR * self._enough]
+        near = [sequence for sequence in beam if last or sequence.cost < NEAR * self._tolerance]
         for group in (near[:1], near[1:]):  # the others are seldom needed
-            refined = yield from self._together(group)
-            yield from self._judge([one for one in refined if last or one.cost <= self._enough])
-            beam = [*(one for one in beam if one not in group), *refined]
+            drafts = [Draft(self._root, sequence.moves, sequence.chains[:-1]) for sequence in group]
+            refined = yield from self._refined(drafts, group, TOGETHER)
+            yield from self._judge([sequence for sequence in refined
+                                    if last or sequence.cost <= self._tolerance])
+            beam = [*(sequence for sequence in beam if sequence not in group), *refined]
             if self.reached:
                 break
-        beam.sort(key=lambda course: course.cost)
+        beam.sort(key=lambda sequence: sequence.cost)
         self._pool += beam
         return beam
 
     def _conclude(self, reason: str) -> Asking[None]:
         """Judge the most promising sequences so far, until one of them is permitted."""
-        pool = sorted((course for course in dict.fromkeys([*self._pool, self.best])
-                       if course not in self._known and self._rank_of(course) < self._judged_rank),
+        pool = sorted((sequence for sequence in dict.fromkeys([*self._pool, self.best])
+                       if sequence not in self._judged and self._rank_of(sequence) < self._judged_rank),
                       key=self._rank_of)
         for first in range(0, len(pool), WIDTH):
             if not self.reached and (first == 0 or self.judged is None):
                 yield from self._judge(pool[first:first + WIDTH])
         self.stop_reason = reason or self._spent
 
-    def _grown(self, beam: Sequence[Course]) -> Asking[list[Course]]:
+    def _grown(self, beam: Sequence[MoveSequence]) -> Asking[list[MoveSequence]]:
         """Return the best sequences with one more move, best first."""
-        drafts = []
-        for course in beam:
-            for choices in carrying(course.end, self._objective.goal, self._options.kinds,
+        drafts: list[Draft] = []
+        for sequence in beam:
+            for choices in carrying(sequence.end, self._objective.goal, self._options.kinds,
                                     self._options.hands):
-                permitted = [draft for move in choices
-                             if self._permits(draft := Draft(course, (move,), course.chains[-1:]))]
-                drafts += permitted[:1]
-        seen = yield from self._tried(drafts)
-        first: list[tuple[Course, Course, Draft]] = []
-        for draft, one in zip(drafts, seen, strict=True):
-            if one is not None:
-                first.append((draft.base, one, draft))
-        chosen = []
-        for course in beam:
-            own = sorted((entry for entry in first if entry[0] is course), key=lambda entry: entry[1].cost)
-            chosen += own[:KEPT]
-        refined = yield from self._refined([entry[2] for entry in chosen], [entry[1] for entry in chosen], 1)
-        return self._distinct(sorted(refined, key=lambda course: course.cost))[:WIDTH]
+                each = [Draft(sequence, (move,), sequence.chains[-1:]) for move in choices]
+                drafts += list(filter(self._permits, each))[:1]
+        simulated = yield from self._tried(drafts)
+        pairs = [(draft, grown) for draft, grown in zip(drafts, simulated, strict=True) if grown is not None]
+        chosen: list[tuple[Draft, MoveSequence]] = []
+        for sequence in beam:
+            own = sorted((pair for pair in pairs if pair[0].base is sequence), key=lambda pair: pair[1].cost)
+            chosen += own[:REFINED]
+        refined = yield from self._refined([draft for draft, _ in chosen], [grown for _, grown in chosen], 1)
+        return self._distinct(sorted(refined, key=lambda sequence: sequence.cost))[:WIDTH]
 
-    def _distinct(self, courses: Sequence[Course]) -> list[Course]:
-        """Return courses, best first, without those that end almost like a better one."""
-        found: list[Course] = []
-        for course in courses:
-            if all(np.linalg.norm(course.end - other.end, axis=1).mean() > ALIKE * course.cost
-                   for other in found):
-                found.append(course)
-        return found
+    def _distinct(self, sequences: Sequence[MoveSequence]) -> list[MoveSequence]:
+        """Return sequences, best first, without those that end almost like a better one."""
+        distinct: list[MoveSequence] = []
+        for sequence in sequences:
+            if all(np.linalg.norm(sequence.end - other.end, axis=1).mean() > ALIKE * sequence.cost
+                   for other in distinct):
+                distinct.append(sequence)
+        return distinct
 
-    def _together(self, courses: Sequence[Course]) -> Asking[list[Course]]:
-        """Return sequences whose displacements were refined all at once."""
-        drafts = [Draft(self._root, course.moves, course.chains[:-1]) for course in courses]
-        return (yield from self._refined(drafts, courses, TOGETHER))
-
-    def _refined(self, drafts: Sequence[Draft], seen: Sequence[Course], iterations: int
-                 ) -> Asking[list[Course]]:
-        """Refine the displacements of drafts, which were seen to become courses, side by side."""
-        under_way: dict[int, tuple[Refinement[Course], list[Floats]]] = {}
-        best = list(seen)
-        for k, (draft, course) in enumerate(zip(drafts, seen, strict=True)):
-            refinement = refine(Best(draft.shifts, course), lambda one: self._objective.residuals(one.end),
-                                iterations)
-            under_way[k] = refinement, next(refinement)
-        while under_way:
-            asked = [(k, drafts[k].shifted(point))
-                     for k, (_, points) in under_way.items() for point in points]
-            told = yield from self._tried([draft for _, draft in asked])
-            for k, (refinement, _) in list(under_way.items()):
-                own = [one for (index, _), one in zip(asked, told, strict=True) if index == k]
-                best[k] = min([best[k], *(one for one in own if one is not None)], key=lambda one: one.cost)
+    def _refined(self, drafts: Sequence[Draft], sequences: Sequence[MoveSequence], iterations: int
+                 ) -> Asking[list[MoveSequence]]:
+        """Refine the displacements of drafts side by side; `sequences` are the drafts as simulated."""
+        best = list(sequences)
+        refinements = [refine(draft.shifts, self._objective.residuals(sequence.end), iterations)
+                       for draft, sequence in zip(drafts, sequences, strict=True)]
+        asked = {k: next(refinement) for k, refinement in enumerate(refinements)}
+        while asked:
+            tried = iter((yield from self._tried([
+                drafts[k].shifted(shifts) for k, points in asked.items() for shifts in points])))
+            for k, points in list(asked.items()):
+                outcomes = list(islice(tried, len(points)))
+                best[k] = min([best[k], *filter(None, outcomes)], key=lambda sequence: sequence.cost)
                 try:
-                    under_way[k] = refinement, refinement.send(own)
+                    asked[k] = refinements[k].send([
+                        None if outcome is None else self._objective.residuals(outcome.end)
+                        for outcome in outcomes])
                 except StopIteration:
-                    del under_way[k]
+                    del asked[k]
         return best
 
-    def _tried(self, drafts: Sequence[Draft]) -> Asking[list[Course | None]]:
-        """Return the courses that drafts become; None where one is not permitted or cannot be simulated."""
+    def _tried(self, drafts: Sequence[Draft]) -> Asking[list[MoveSequence | None]]:
+        """Return the sequences that drafts become; None if one is not permitted or cannot be simulated."""
         permitted = [draft for draft in drafts if self._permits(draft)]
-        jobs = [Job(self._chain(draft.base), self._steps(draft.moves, draft.before), self._physical,
-                    self._watched) for draft in permitted]
-        told = (yield jobs) if jobs else []
-        found = {id(draft): self._course(draft, one) for draft, one in zip(permitted, told, strict=True)}
-        return [found.get(id(draft)) for draft in drafts]
+        jobs = [RehearsalJob(draft.base.chain if draft.base.moves else self._start,
+                             self._steps(draft.moves, draft.before), self._physical, self._watched)
+                for draft in permitted]
+        rehearsals = (yield jobs) if jobs else []
+        outcomes = {id(draft): self._sequence(draft, rehearsal)
+                    for draft, rehearsal in zip(permitted, rehearsals, strict=True)}
+        return [outcomes.get(id(draft)) for draft in drafts]
 
-    def _chain(self, course: Course) -> Chain:
-        return course.chain if course.moves else self._start
-
-    def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[Step, ...]:
+    def _steps(self, moves: Sequence[Move], before: Floats) -> tuple[ActionStep, ...]:
         return in_turn([move.step(points, self._levels, self._options.height, self._options.speed)
                         for move, points in zip(moves, before, strict=True)])
 
     def _permits(self, draft: Draft) -> bool:
-        for step in self._steps(draft.moves, draft.before):
-            if not self._allowed(self._limits.refusal(step.action) or clash(step.action)):
-                return False
-        return True
+        return all(self._allowed(self._limits.refusal(step.action) or clash(step.action))
+                   for step in self._steps(draft.moves, draft.before))
 
     def _allowed(self, refusal: str) -> bool:
         """Count a refusal; tell whether there was none."""
@@ -325,34 +355,77 @@ class BeamSearch:
             self.refusals[refusal] = self.refusals.get(refusal, 0) + 1
         return not refusal
 
-    def _course(self, draft: Draft, seen: Rehearsal) -> Course | None:
-        """Return the course that a draft becomes; None if it failed or is not permitted."""
-        if seen.failure or not self._allowed(self._forbidden(seen)):
+    def _sequence(self, draft: Draft, rehearsal: Rehearsal) -> MoveSequence | None:
+        """Return the sequence that a draft becomes; None if it failed or is not permitted."""
+        if rehearsal.failure or not self._allowed(self._refusal(rehearsal)):
             return None
-        found = Course((*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, seen.chains]),
-                       self._objective.cost(seen.chains[-1]))
-        if found.cost < self.best.cost:
-            self.best = found
-        return found
+        sequence = MoveSequence(
+            (*draft.base.moves, *draft.moves), np.concatenate([draft.base.chains, rehearsal.chains]),
+            self._objective.cost(rehearsal.chains[-1]))
+        if sequence.cost < self.best.cost:
+            self.best = sequence
+        return sequence
 
-    def _forbidden(self, seen: Rehearsal) -> str:
+    def _refusal(self, rehearsal: Rehearsal) -> str:
         """Return why the DLO must not move like this; empty if it may."""
-        if not self._options.crossings and any(crossings(chain) > self._crossings for chain in seen.chains):
+        if not self._options.crossings and any(
+                crossings(chain) > self._crossings for chain in rehearsal.chains):
             return 'the DLO crosses itself'
-        return self._limits.entered(np.concatenate([*seen.courses, seen.chains]))
+        return self._limits.entered(np.concatenate([*rehearsal.trajectories, rehearsal.chains]))
 
-    def _judge(self, courses: Sequence[Course]) -> Asking[None]:
-        """Simulate courses at once, with the found parameters and with the draws."""
-        each = [self._physical, *self._draws]
-        planned = [self._steps(course.moves, course.chains[:-1]) for course in courses]
-        jobs = [Job(self._start, steps, physical, self._watched) for steps in planned for physical in each]
-        told = (yield jobs) if jobs else []
-        self._known.update(courses)
-        for k, (course, steps) in enumerate(zip(courses, planned, strict=True)):
-            best, *drawn = told[k * len(each):(k + 1) * len(each)]
-            drawn = [one for one in drawn if not one.failure]
-            if best.failure or not all(self._allowed(self._forbidden(one)) for one in (best, *drawn)):
+    def _judge(self, sequences: Sequence[MoveSequence]) -> Asking[None]:
+        """Simulate whole sequences with the found parameters and with the draws."""
+        parameters = [self._physical, *self._draws]
+        planned = [self._steps(sequence.moves, sequence.chains[:-1]) for sequence in sequences]
+        jobs = [RehearsalJob(self._start, steps, physical, self._watched)
+                for steps in planned for physical in parameters]
+        rehearsals = iter((yield jobs) if jobs else [])
+        self._judged.update(sequences)
+        for sequence, steps in zip(sequences, planned, strict=True):
+            best, *drawn = islice(rehearsals, len(parameters))
+            drawn = [rehearsal for rehearsal in drawn if not rehearsal.failure]
+            if best.failure or not all(self._allowed(self._refusal(one)) for one in (best, *drawn)):
                 continue
             cost = float(np.mean([self._objective.cost(one.chains[-1]) for one in drawn or [best]]))
             if self._rank(cost, len(steps)) < self._judged_rank:
-                self.judged = Judged(course, steps, best, tuple(drawn), cost)
+                self.judged = JudgedSequence(sequence, steps, best, tuple(drawn), cost)
+
+
+def refine(shifts: Floats, residuals: Floats, iterations: int
+           ) -> Generator[Floats, Sequence[Floats | None], None]:
+    """
+    Lower the sum of squared residuals by damped Gauss-Newton steps.
+
+    Yield (k, d) displacements [m] to try, and receive their residuals, None for what is impossible.  Unlike a
+    search, it has no bounds, and tries three lengths of each step side by side: a rollout takes long.
+
+    :param shifts: (d,) [m] where it begins; `residuals` (m,) [m] there.
+    :param iterations: at most.
+    """
+    jacobian: Floats | None = None
+    for _ in range(iterations):
+        tried: list[tuple[Floats, Floats | None]] = []
+        if jacobian is None:
+            sides = Differences.one_sided(
+                shifts, np.arange(len(shifts)), np.where(shifts < 0, -DIFFERENCE, DIFFERENCE))
+            answers = yield sides.points
+            tried += zip(sides.points, answers, strict=True)
+            jacobian = sides.jacobian(np.zeros((len(residuals), len(shifts))), answers, residuals)
+        points = shifts + np.outer(SHARES, _damped_step(Linearisation(shifts, residuals, jacobian)))
+        answers = yield points
+        tried += zip(points, answers, strict=True)
+        costs = [np.inf if answer is None else float(np.sum(answer**2)) for _, answer in tried]
+        moved, after = tried[int(np.argmin(costs))]
+        if after is None or min(costs) >= WORTH * float(residuals @ residuals):
+            break
+        step = moved - shifts
+        jacobian = broyden(jacobian, step, after - residuals - jacobian @ step)
+        shifts, residuals = moved, after
+
+
+def _damped_step(model: Linearisation) -> Floats:
+    """Return the damped Gauss-Newton step, (d,) [m], within LONGEST."""
+    curvature = model.information
+    damping = DAMPING * np.trace(curvature) / len(curvature) + 1e-9
+    step = model.step(damping * np.eye(len(curvature)))
+    return np.asarray(step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-12)))

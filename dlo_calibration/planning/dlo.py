@@ -69,24 +69,24 @@ class Posterior:
     thickest: float = np.inf
 
     @classmethod
-    def of(cls, found: CalibratedDlo) -> Posterior:
+    def of(cls, dlo: CalibratedDlo) -> Posterior:
         """Return the posterior of a calibrated DLO."""
-        estimates = [found.parameters[name] for name in found.space.free]
-        values = np.array([one.value for one in estimates])
-        known = found.correlations
-        correlations = np.eye(len(values)) if known is None else np.array(
-            [[known[one][other] for other in found.space.free] for one in found.space.free])
-        return cls(found.space, found.length, frozen_array(values),
-                   frozen_array(np.maximum(values - [one.lower for one in estimates], 0) / Z90),
-                   frozen_array(np.maximum([one.upper for one in estimates] - values, 0) / Z90),
-                   frozen_array(np.where(np.isfinite(correlations), correlations, np.eye(len(values)))))
+        names, known = dlo.space.free, dlo.correlations
+        values, lower, upper = (np.array([getattr(dlo.parameters[name], end) for name in names])
+                                for end in ('value', 'lower', 'upper'))
+        correlations = np.eye(len(names)) if known is None else np.array(
+            [[known[name][other] for other in names] for name in names])
+        return cls(dlo.space, dlo.length, frozen_array(values),
+                   frozen_array(np.maximum(values - lower, 0) / Z90),
+                   frozen_array(np.maximum(upper - values, 0) / Z90),
+                   frozen_array(np.where(np.isfinite(correlations), correlations, np.eye(len(names)))))
 
     def lying(self, chain: Chain, simulation: Options) -> Posterior:
         """
-        Return the distribution for a DLO that is seen lying on the table.
+        Return the distribution for a DLO that was observed lying on the table.
 
-        It is not thicker than it lies high: trials in which it does not touch itself leave its radius
-        open, and a draw with a far larger one would push its parts away from each other.
+        The height at which it lies bounds its radius: trials in which it does not touch itself leave the
+        radius open, and a draw with a far larger one would push its parts away from each other.
         """
         level = lying_level(chain, simulation.table_height) if simulation.table and not simulation.scene \
             else None
@@ -100,13 +100,13 @@ class Posterior:
         return self._physical(self.values)
 
     def draws(self, count: int, seed: int) -> list[dict[str, float]]:
-        """Return physical values of all parameters, in SI units, at `count` draws; the same for a seed."""
+        """Return physical values of all parameters, in SI units, at `count` draws with a random seed."""
         variances, axes = np.linalg.eigh(self.correlations)
         normal = np.random.default_rng(seed).standard_normal((count, len(self.values)))
         normal = normal * np.sqrt(np.maximum(variances, 0)) @ axes.T
         drawn = self.values + normal * np.where(normal < 0, self.below, self.above)
-        physical = [self._physical(one) for one in np.clip(drawn, 0.0, SCALE)]
-        return [{**one, 'self_collision': min(one['self_collision'], self.thickest)} for one in physical]
+        physical = [self._physical(values) for values in np.clip(drawn, 0.0, SCALE)]
+        return [{**draw, 'self_collision': min(draw['self_collision'], self.thickest)} for draw in physical]
 
     def _physical(self, values: Floats) -> dict[str, float]:
         named = dict(zip(self.space.free, map(float, values), strict=True))

@@ -13,8 +13,9 @@ import numpy as np
 
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Floats, frozen_array
-from dlo_calibration.planning.options import HANDS, KINDS
-from dlo_calibration.planning.rehearsal import Step
+from dlo_calibration.planning.limits import HANDS
+from dlo_calibration.planning.options import KINDS
+from dlo_calibration.planning.rehearsal import ActionStep
 
 LIFTING = KINDS[0]  # grasp_and_place; the other kind stays on the table
 MOST_GRIPS = 11  # places along the DLO where one hand may grip; neighbours do nearly the same
@@ -42,7 +43,7 @@ class Move:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'shifts', frozen_array(np.reshape(self.shifts, (len(self.grips), 2))))
 
-    def step(self, points: Floats, levels: Floats, height: float, speed: float) -> Step:
+    def step(self, points: Floats, levels: Floats, height: float, speed: float) -> ActionStep:
         """
         Return the paths of the hands, which have waypoints at the same times, and open at the end.
 
@@ -64,23 +65,23 @@ class Move:
                 kept.append(place)
                 times.append(times[-1] + leg / speed)
         path = np.array(kept)
-        return Step(Action(tuple(Hand(name, (grip,), np.array(times), path[:, k])
+        return ActionStep(Action(tuple(Hand(name, (grip,), np.array(times), path[:, k])
                                  for k, (name, grip) in enumerate(zip(self.hands, self.grips, strict=True)))))
 
 
 def clash(action: Action) -> str:
     """
-    Say where the hands of a move are in each other's way: a phrase, empty if they are not.
+    Return why the hands of a move get into each other's way; empty if they do not.
 
     :param action: its hands have waypoints at the same times, and move straight from one to the next.
     """
-    for one, other in combinations(action.hands, 2):
-        between = other.positions - one.positions
+    for hand, other in combinations(action.hands, 2):
+        between = other.positions - hand.positions
         leg = np.diff(between, axis=0)
         share = -np.sum(between[:-1] * leg, axis=1) / np.maximum(np.sum(leg**2, axis=1), SHORTEST_LEG**2)
         nearest = np.vstack([between, between[:-1] + np.clip(share, 0, 1)[:, None] * leg])
         if np.linalg.norm(nearest, axis=1).min() < HANDS_APART:
-            return f'{one.name} and {other.name} come nearer to each other than {1e3 * HANDS_APART:.0f} mm'
+            return f'{hand.name} and {other.name} come nearer to each other than {1e3 * HANDS_APART:.0f} mm'
     return ''
 
 
@@ -102,10 +103,10 @@ def carrying(points: Floats, goal: Floats, kinds: Sequence[str], hands: int) -> 
     """
     single = [(grip,) for grip in grips(len(points), MOST_GRIPS)]
     pairs = list(combinations(grips(len(points), MOST_PAIRED_GRIPS), 2)) if hands > 1 else []
-    found = []
+    moves = []
     for kind in kinds:
         for gripped in [*single, *pairs]:
             shifts = (goal - points)[list(gripped), :2]
             choices = [HANDS, HANDS[::-1]] if len(gripped) > 1 else [(name,) for name in HANDS[:hands]]
-            found.append(tuple(Move(kind, gripped, names, shifts) for names in choices))
-    return found
+            moves.append(tuple(Move(kind, gripped, names, shifts) for names in choices))
+    return moves

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dlo_calibration.calibration.declaration import declared, DeclaredOptions, MACHINE, SEARCH
+from dlo_calibration.calibration.options import declared, DeclaredOptions, MACHINE, SEARCH
 from dlo_calibration.errors import InputError
-from dlo_calibration.planning.regions import REACH, read_box, read_reach
+from dlo_calibration.planning.limits import HANDS, Limits, REACH
 
-HANDS = ('hand_1', 'hand_2')
 KINDS = ('grasp_and_place', 'drag')  # of actions
 POINTS, SCORE = 'points', 'score'  # objectives
 
@@ -56,7 +55,13 @@ class PlanOptions(DeclaredOptions):
         if not self.kinds or len(set(self.kinds)) < len(self.kinds):
             raise InputError('parameter kinds', f'{" ".join(self.kinds) or "no name"}',
                              'one or more different names', 'name each kind of action once')
-        for name in ('reach_1', 'reach_2'):
-            read_reach(f'parameter {name}', getattr(self, name))
-        for text in self.no_go:
-            read_box('parameter no_go', text)
+        self.limits  # noqa: B018
+
+    @property
+    def limits(self) -> Limits:
+        """
+        Where hands and DLO may be.
+
+        :raises InputError: if one of the options cannot be read.
+        """
+        return Limits.read(self.reach_1, self.reach_2, self.no_go)

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from dlo_calibration.model.action import Action
-from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.calibration.result import with_nulls
+from dlo_calibration.model.action import Action, Hand, NO_ROTATION
+from dlo_calibration.model.chain import Chain, Floats, grip_place
 from dlo_calibration.model.pose import Pose
 
 
@@ -63,7 +65,7 @@ class Plan:
     :param seconds: that the plan took.
     :param seed: of the search and the draws.
     :param stop_reason: why the search ended, in words.
-    :param remarks: sentences for the user: why the goal cannot be reached, what the limits prevented.
+    :param warnings: sentences for the user: why the goal cannot be reached, what the limits prevented.
     """
 
     start: Chain
@@ -78,9 +80,56 @@ class Plan:
     seconds: float
     seed: int
     stop_reason: str
-    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def moved(self, pose: Pose) -> Plan:
         """Return the plan in another frame, in which its own has a pose."""
         return replace(self, start=pose.chain(self.start), goal=pose.chain(self.goal),
                        actions=tuple(action.moved(pose) for action in self.actions))
+
+
+def plain_plan(plan: Plan) -> dict[str, Any]:
+    """
+    Return a plan as plain values, under the keys that `plan --json` prints and `~/steps` carries.
+
+    Lengths are in m, times in s, the score in cm.
+    """
+    values: dict[str, Any] = with_nulls({
+        'actions': [plain_action(plan.start, one.name, one.action, one.predicted, one.lower, one.upper)
+                    for one in plan.actions],
+        'error_before_m': plan.error_before, 'error_after_m': plan.error_after,
+        'error_after_percent_of_length': 100 * plan.error_after / plan.start.length,
+        'score_after': plan.score_after, 'reached': plan.reached, 'tolerance_m': plan.tolerance,
+        'rollouts': plan.rollouts, 'seconds': plan.seconds, 'seed': plan.seed,
+        'stop_reason': plan.stop_reason, 'remarks': plan.warnings})
+    return values
+
+
+def plain_action(start: Chain, name: str, action: Action, predicted: Floats, lower: Floats, upper: Floats
+                 ) -> dict[str, Any]:
+    """
+    Return an action and the DLO at rest after it as plain values.
+
+    :param start: a chain with the same points as the DLO.
+    :param predicted: (n, 3) [m]; `lower` (n, 3) and `upper` (n, 3) are ends of the 90 % intervals.
+    """
+    return {'name': name, 'hands': [_plain_hand(start, action, hand) for hand in action.hands],
+            'predicted': predicted.tolist(), 'predicted_lower_upper_m': [lower.tolist(), upper.tolist()]}
+
+
+def _plain_hand(start: Chain, action: Action, hand: Hand) -> dict[str, Any]:
+    """
+    Return a hand, with times from the start of its action.
+
+    A clamp, which grips several points, also has `grips`.  A hand that turns also has `orientations`:
+    quaternions x y z w.
+    """
+    along = start.arc_lengths()
+    values = {'name': hand.name, 'grip': hand.grips[0],
+              'grip_fraction': grip_place(along, hand.grips[0], hand.offset) / float(along[-1]),
+              'waypoints': np.column_stack([hand.times - action.start, hand.positions]).tolist()}
+    if len(hand.grips) > 1:
+        values['grips'] = list(hand.grips)
+    if (hand.orientations != NO_ROTATION).any():
+        values['orientations'] = hand.orientations.tolist()
+    return values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import CancelledError, Executor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import time
 from typing import Callable, Iterator, Mapping
 
@@ -16,18 +16,181 @@ import numpy as np
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.pool import Pool, Threads
+from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, frozen_array
-from dlo_calibration.observation.table import lying_level
-from dlo_calibration.planning.beam import BeamSearch, Judged
-from dlo_calibration.planning.checks import checked, remarks
+from dlo_calibration.model.parameters import GRAVITY, natural_curvature
+from dlo_calibration.observation.table import HANGING, lying_level
+from dlo_calibration.planning.beam import BeamSearch, JudgedSequence, Objective
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior
-from dlo_calibration.planning.limits import Limits
-from dlo_calibration.planning.objective import Objective
+from dlo_calibration.planning.limits import crossings, HANDS
 from dlo_calibration.planning.options import PlanOptions
 from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.planning.prediction import intervals
-from dlo_calibration.planning.rehearsal import Rehearser
+from dlo_calibration.planning.rehearsal import ActionStep, RehearsalJob, Rehearser
+
+START, GOAL = 'start chain', 'goal chain'  # in errors
+OTHER_LENGTH = 0.10  # share of the length; with a larger difference, the unit or the DLO is another one
+ELSEWHERE = 0.02  # share of the length; points of start and goal that are so far apart along it do not match
+DRAWS = 3  # from the posterior, at most, that are laid on the goal
+
+
+def checked(dlo: CalibratedDlo, start: Chain, goal: Chain, simulation: Options,
+            options: PlanOptions) -> tuple[Chain, Chain]:
+    """
+    Return the start and the goal that a plan is made for.
+
+    The goal is resampled at the fractions of the length at which the start has its points, unless it has them
+    there, and is moved to the height of the start: both lie on the same table.
+
+    :raises InputError: if the result lacks values; if the start or the goal has another length than the DLO,
+        or is in the air; if the goal is in a no-go box, or has more crossings than the start although
+        no action may put the DLO over itself.
+    """
+    _check_dlo(dlo)
+    _check_length(START, start, dlo.length, 'the calibrated DLO')
+    _check_length(GOAL, goal, start.length, 'the start')
+    if simulation.table and not simulation.scene:
+        rise = _level(START, start, simulation.table_height) - _level(GOAL, goal, simulation.table_height)
+    elif simulation.scene:  # where it lies on obstacles, nothing is known about its height
+        rise = 0.0
+    else:
+        raise InputError('parameter table', 'false, and no scene', 'something that the DLO lies on',
+                         'leave table at true, or name a scene')
+    goal = _matched(goal, start, rise)
+    if box := options.limits.box(goal.points[None]):
+        raise InputError(GOAL, f'a part in the no-go box {box}', 'a goal outside of all no-go boxes',
+                         'move the goal, or correct no_go')
+    more = crossings(goal.points) - crossings(start.points)
+    if more > 0 and not options.crossings:
+        raise InputError(GOAL, f'{more} crossing(s) of the DLO with itself more than in the start',
+                         'no more than there', 'allow them with crossings, or choose another goal')
+    return start, goal
+
+
+def goal_warnings(rehearse: Rehearser, posterior: Posterior, start: Chain, goal: Chain,
+            options: PlanOptions) -> tuple[str, ...]:
+    """
+    Return why a goal cannot be reached exactly, and how near the DLO gets.
+
+    :param rehearse: simulates at most 1 + DRAWS actions.
+    :param start: as `checked` returns it, and `goal` likewise.
+    :raises CancelledError: as `rehearse` does.
+    """
+    return (*_warnings_of_length(start, goal, options.tolerance / 100),
+            *_warnings_of_limits(start, goal, options),
+            *_warnings_of_rest(rehearse, posterior, goal, options))
+
+
+def _check_dlo(dlo: CalibratedDlo) -> None:
+    unusable = [name for name, estimate in dlo.parameters.items()
+                if not np.isfinite([estimate.value, estimate.lower, estimate.upper]).all()]
+    if unusable or not 0 < dlo.length < np.inf or not np.isfinite(dlo.errors.rms):
+        raise InputError('result', f'no number for {", ".join(unusable) or "length or errors"}',
+                         'finite values, intervals and errors', 'calibrate again')
+
+
+def _check_length(thing: str, chain: Chain, length: float, whose: str) -> None:
+    if not abs(chain.length / length - 1) <= OTHER_LENGTH:
+        raise InputError(thing, f'a length of {_mm(chain.length)}',
+                         f'that of {whose}, {_mm(length)}, within {100 * OTHER_LENGTH:.0f} %',
+                         'send metres, and the whole of the same DLO')
+
+
+def _level(thing: str, chain: Chain, table_height: float) -> float:
+    """Return the height [m] at which a chain lies on the table; raise the InputError if it does not."""
+    level, z = lying_level(chain, table_height), chain.points[:, 2]
+    # A strand that lies on another one is higher by the diameter.
+    if level is None or z.max() - level > HANGING + 2 * max(level - table_height, 0.0):
+        raise InputError(
+            thing, f'points {1e3 * (z.min() - table_height):.0f} to {1e3 * (z.max() - table_height):.0f} mm '
+            'above the table', 'a DLO that lies on the table, as hands open after each action',
+            'lay it down, or correct table_height')
+    return level
+
+
+def _matched(goal: Chain, start: Chain, rise: float) -> Chain:
+    """Return a goal with the points of the start, higher by `rise` [m]; it is itself if nothing changes."""
+    fractions = start.arc_lengths() / start.length
+    same = len(goal) == len(start) and np.abs(
+        goal.arc_lengths() / goal.length - fractions).max() <= ELSEWHERE
+    if same and rise == 0:
+        return goal
+    up = np.array([0.0, 0.0, rise])
+    return replace(goal, points=goal.points + up) if same else Chain(
+        goal.resample(fractions * goal.length) + up)
+
+
+def _warnings_of_length(start: Chain, goal: Chain, tolerance: float) -> Iterator[str]:
+    """Warn of another length: if both middles coincide, a point at s = 0..1 is off by |s - 1/2| of it."""
+    longer = goal.length - start.length
+    if abs(longer) > tolerance * start.length:
+        yield (f'the goal is {_percent(longer, start)} {"longer" if longer > 0 else "shorter"} than '
+               f'the DLO, {_mm(goal.length)} instead of {_mm(start.length)}, so its points stay about '
+               f'{_mm(abs(longer) / 4)} away from the goal on average')
+
+
+def _warnings_of_limits(start: Chain, goal: Chain, options: PlanOptions) -> Iterator[str]:
+    """Warn of what no hand can reach, and of a start in a no-go box."""
+    limits, hands = options.limits, HANDS[:options.hands]
+    whose = ' and '.join(hands)
+    start_within, goal_within = (np.any(
+        [limits.reach[name].contains(chain.points, chain.points) for name in hands], axis=0)
+        for chain in (start, goal))
+    if not start_within.any():
+        yield f'no point of the DLO is within the reach of {whose}, so nothing can move it'
+    if not goal_within.all():
+        yield (f'{(~goal_within).sum()} of the {len(goal)} points of the goal are outside the reach of '
+               f'{whose}, so they can only be moved by other parts of the DLO')
+    if box := limits.box(start.points[None]):
+        yield f'the DLO is in the no-go box {box} at the start'
+
+
+def _warnings_of_rest(rehearse: Rehearser, posterior: Posterior, goal: Chain,
+                     options: PlanOptions) -> Iterator[str]:
+    """Lay the DLO exactly on the goal, let it go, and warn if it moves far."""
+    middle = len(goal) // 2
+    touch = ActionStep(Action((Hand(HANDS[0], (middle,), np.zeros(1), goal.points[[middle]]),)))
+    drawn = posterior.draws(min(DRAWS, options.draws), options.seed)
+    rehearsals = rehearse([RehearsalJob(goal, (touch,), physical) for physical in (posterior.best, *drawn)])
+    failures = [rehearsal.failure for rehearsal in rehearsals if rehearsal.failure]
+    if failures:
+        yield f'whether the DLO stays on the goal is unknown: {failures[0]}'
+        return
+    away = np.stack([np.linalg.norm(rehearsal.chains[-1] - goal.points, axis=1) for rehearsal in rehearsals])
+    each, at = away.mean(axis=1), goal.arc_lengths() / goal.length
+    if each.mean() > options.tolerance / 100 * goal.length / 2:
+        worst = int(away.mean(axis=0).argmax())
+        curved = natural_curvature(posterior.best, at).any()
+        yield (f'laid exactly on the goal and let go, the DLO springs back by {_mm(each.mean())} on average '
+               f'({_percent(each.mean(), goal)} of the length; {_mm(each.min())} to {_mm(each.max())} within '
+               f'the uncertainty of its parameters), and by {_mm(away[:, worst].mean())} at {at[worst]:.2f} '
+               f'of the length: friction holds only bends {"beyond its rest shape " * bool(curved)}with a '
+               'radius above about '
+               f'{_mm(sharpest_bend(posterior.best, goal.length))}, and none at the ends')
+
+
+def sharpest_bend(physical: Mapping[str, float], length: float) -> float:
+    """
+    Return approximately the smallest radius of a bend [m] that friction on the table holds.
+
+    The lateral force of a bent rod without tension is EI kappa'' per length, which is at most mu m g / L in
+    equilibrium.  A bend of the radius R begins and ends within about R, so kappa'' is about 1 / R^3.
+
+    :param physical: parameters by name (SI units).
+    :param length: of the DLO [m].
+    """
+    held = physical['friction'] * physical['mass'] * GRAVITY / length
+    return float(np.cbrt(physical['flexibility'] / held))
+
+
+def _percent(length: float, chain: Chain) -> str:
+    return f'{100 * abs(length) / chain.length:.1f} %'
+
+
+def _mm(length: float) -> str:
+    return f'{1e3 * length:.1f} mm' if length < 0.01 else f'{1e3 * length:.0f} mm'
 
 
 @dataclass(frozen=True)
@@ -72,11 +235,11 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     tolerance = options.tolerance / 100 * start.length
     objective = Objective(start, goal, options.objective)
     level = None if simulation.scene else lying_level(start, simulation.table_height)
-    search = BeamSearch(start, objective, tolerance, options, Limits.of(options),
+    search = BeamSearch(start, objective, tolerance, options,
                         goal.points[:, 2] if level is None else np.full(len(start), level), posterior.best,
                         posterior.draws(options.draws, options.seed))
 
-    def tell(rollouts: int) -> None:
+    def report(rollouts: int) -> None:
         expected = max(search.expected, rollouts)
         left = (clock() - begin) * (expected - rollouts) / rollouts
         on_progress(PlanProgress(search.actions, rollouts, expected, objective.error(search.best.end), left))
@@ -84,47 +247,42 @@ def plan(found: CalibratedDlo, start: Chain, goal: Chain, options: PlanOptions |
     with closing(make_simulator(simulation)) as simulator, closing(Threads(options.workers)) as threads:
         rehearse = Rehearser(Pool(simulator, executor or threads, should_stop))
         last = Rehearser(Pool(simulator, executor or threads))
-        _finish(search, rehearse, last, tell)
-        said = () if search.reached else (*remarks(last, posterior, start, goal, options),
-                                          *_remarks_on_refusals(search.refusals))
+        try:
+            while jobs := search.ask():
+                search.tell(rehearse(jobs))
+                report(rehearse.count)
+        except CancelledError:  # the best plan so far still needs some rehearsals
+            search.stop()
+            while jobs := search.ask():
+                search.tell(last(jobs))
+        warnings = () if search.reached else (*goal_warnings(last, posterior, start, goal, options),
+                                              *_warnings_of_refusals(search.refusals))
     ends = [start.points] if search.judged is None else [
-        one.chains[-1] for one in search.judged.drawn or [search.judged.best]]
+        rehearsal.chains[-1] for rehearsal in search.judged.drawn or [search.judged.best]]
     return Plan(
         start, goal, () if search.judged is None else planned_actions(search.judged, found.errors.rms),
         error_before=objective.error(start.points),
         error_after=float(np.mean([objective.error(end) for end in ends])),
         score_after=float(np.mean([objective.score(end) for end in ends])), reached=search.reached,
         tolerance=tolerance, rollouts=rehearse.count + last.count, seconds=clock() - begin,
-        seed=options.seed, stop_reason=search.stop_reason, remarks=said)
+        seed=options.seed, stop_reason=search.stop_reason, warnings=warnings)
 
 
-def _finish(search: BeamSearch, rehearse: Rehearser, last: Rehearser, tell: Callable[[int], None]) -> None:
-    """Search to the end; once `rehearse` is stopped, `last` rehearses what the best plan so far needs."""
-    try:
-        while jobs := search.ask():
-            search.tell(rehearse(jobs))
-            tell(rehearse.count)
-    except CancelledError:
-        search.stop()
-        while jobs := search.ask():
-            search.tell(last(jobs))
-
-
-def planned_actions(judged: Judged, error: float) -> tuple[PlannedAction, ...]:
+def planned_actions(judged: JudgedSequence, error: float) -> tuple[PlannedAction, ...]:
     """
     Return the actions of a judged sequence, with the intervals of its predictions.
 
     :param error: root mean square point distance that the calibration left [m].
     """
-    lower, upper = intervals(judged.best.chains, [one.chains for one in judged.drawn], error / np.sqrt(3))
+    lower, upper = intervals(judged.best.chains, [drawn.chains for drawn in judged.drawn], error / np.sqrt(3))
     return tuple(
         PlannedAction(move.name, step.starting(0.0).action, frozen_array(judged.best.chains[k]),
                       frozen_array(lower[k]), frozen_array(upper[k]))
-        for k, (move, step) in enumerate(zip(judged.course.moves, judged.steps, strict=True)))
+        for k, (move, step) in enumerate(zip(judged.sequence.moves, judged.steps, strict=True)))
 
 
-def _remarks_on_refusals(refusals: Mapping[str, int]) -> Iterator[str]:
-    """Tell what prevented most of the moves that were not permitted."""
+def _warnings_of_refusals(refusals: Mapping[str, int]) -> Iterator[str]:
+    """Warn of moves that were not permitted, with the most frequent reason."""
     if refusals:
         most = max(refusals, key=lambda why: refusals[why])
         yield f'{sum(refusals.values())} moves that were tried are not permitted, mostly because {most}'

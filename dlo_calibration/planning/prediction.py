@@ -8,26 +8,27 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Callable, Mapping, Sequence, Union
+from typing import Any, Callable, Mapping, Sequence, Union
 
 import numpy as np
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.result import with_nulls
 from dlo_calibration.errors import InputError, SimulationError
 from dlo_calibration.evaluation.pool import Pool, Threads
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array
-from dlo_calibration.model.manipulation import PATHS, Together
-from dlo_calibration.model.named_actions import NamedAction
+from dlo_calibration.model.named_actions import NamedAction, SimultaneousActions
 from dlo_calibration.observation.noise import NO_NOISE, noise_of
 from dlo_calibration.planning.dlo import CalibratedDlo, Posterior, Z90
-from dlo_calibration.planning.rehearsal import in_turn, Job, PAUSE, Rehearsal, Rehearser, Step
+from dlo_calibration.planning.plan import plain_action
+from dlo_calibration.planning.rehearsal import ActionStep, in_turn, PAUSE, Rehearsal, RehearsalJob, rehearse
 
 DRAWS = 20  # from the posterior, which is enough for the ends of a 90 % interval
 INTERVAL = (5.0, 95.0)  # %
-Doing = Union[NamedAction, Action, Step, Together]
+Doing = Union[NamedAction, Action, ActionStep, SimultaneousActions]
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class PredictedStep:
     """
     An action, and the DLO at rest after it.
 
-    :param name: of the action: that of a named action, else `hand_paths`; see `Together`.
+    :param name: of the action: that of a named action, else `hand_paths`; see `SimultaneousActions`.
     :param step: the paths of the hands, in the time of the whole sequence.
     :param chain: (n, 3) [m] with the found parameters.
     :param lower: (n, 3) [m] lower ends of the 90 % intervals of each coordinate; `upper` (n, 3) upper ends.
@@ -43,7 +44,7 @@ class PredictedStep:
     """
 
     name: str
-    step: Step
+    step: ActionStep
     chain: Floats
     lower: Floats
     upper: Floats
@@ -57,14 +58,14 @@ class Prediction:
 
     :param draws: number of draws from the posterior that were simulated, besides the found parameters.
     :param physical: the found parameters by name (SI units), as they were simulated.
-    :param remarks: sentences for the user, such as a draw that could not be simulated.
+    :param warnings: sentences for the user, such as that a draw could not be simulated.
     """
 
     start: Chain
     steps: tuple[PredictedStep, ...]
     draws: int
     physical: Mapping[str, float]
-    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'physical', MappingProxyType(dict(self.physical)))
@@ -79,12 +80,12 @@ def simulate(found: CalibratedDlo, chain: Chain,
 
     A named action begins where the DLO is predicted to be with the found parameters; the hands
     then take the same paths for every draw.  Actions follow one another when the DLO is at rest.
-    Each draw also has another start, as the noise of the given one moves what is predicted.
+    Each draw also has another start, because the noise of the given one affects the prediction.
 
     :param found: a `CalibrationResult`, or the `Description` that `read_result` returns.
     :param chain: the DLO before the first action.
-    :param actions: at least one; an `Action` opens its hands at the end, a `Step` says which stay closed,
-        and `Together` combines actions that overlap in time.
+    :param actions: at least one; an `Action` opens its hands at the end, an `ActionStep` says which stay
+        closed, and `SimultaneousActions` combines actions that overlap in time.
     :param options: of the simulation; None: the defaults.
     :param draws: from the posterior, for the intervals; 0: the intervals contain the model error only.
     :raises InputError: if an action is impossible with the chain before it.
@@ -97,21 +98,20 @@ def simulate(found: CalibratedDlo, chain: Chain,
     posterior = Posterior.of(found).lying(chain, options)
     with closing(make_simulator(options)) as simulator, closing(Threads(options.workers)) as threads:
         pool = Pool(simulator, threads, should_stop)
-        rehearse = Rehearser(pool)
-        steps, best = _steps(rehearse, chain, actions, posterior.best)
-        drawn = rehearse([Job(start, steps, physical) for start, physical in zip(
+        steps, best = _steps(pool, chain, actions, posterior.best)
+        drawn = rehearse(pool, [RehearsalJob(start, steps, physical) for start, physical in zip(
             _starts(chain, draws, seed), posterior.draws(draws, seed), strict=True)])
-        finer = _finer(pool, Job(chain, steps, posterior.best))
-    failures = [one.failure for one in drawn if one.failure]
-    remarks = () if not failures else (
+        finer = _finer(pool, RehearsalJob(chain, steps, posterior.best))
+    failures = [rehearsal.failure for rehearsal in drawn if rehearsal.failure]
+    warnings = () if not failures else (
         f'{len(failures)} of {draws} draws from the posterior could not be simulated: {failures[0]}',)
-    lower, upper = intervals(best.chains, [one.chains for one in drawn if not one.failure],
+    lower, upper = intervals(best.chains, [draw.chains for draw in drawn if not draw.failure],
                              found.errors.rms / np.sqrt(3), finer)
     return Prediction(
-        chain, tuple(PredictedStep(_name(action), step, frozen_array(best.chains[k]), frozen_array(lower[k]),
+        chain, tuple(PredictedStep(action.name, step, frozen_array(best.chains[k]), frozen_array(lower[k]),
                                    frozen_array(upper[k]), best.settled[k])
                      for k, (action, step) in enumerate(zip(actions, steps, strict=True))),
-        draws, posterior.best, remarks)
+        draws, posterior.best, warnings)
 
 
 def intervals(best: Floats, drawn: Sequence[Floats], error: float,
@@ -144,59 +144,70 @@ def _starts(chain: Chain, draws: int, seed: int) -> list[Chain]:
             for _ in range(draws)]
 
 
-def _finer(pool: Pool, job: Job) -> Floats | None:
+def _finer(pool: Pool, job: RehearsalJob) -> Floats | None:
     """Return the chains after each action by a finer simulation; None if there is none."""
     refined = pool.refined()
     if refined is None:
         return None
     with closing(refined.simulator):
-        found, = Rehearser(refined)([job])
-    return None if found.failure else found.chains
+        rehearsal, = rehearse(refined, [job])
+    return None if rehearsal.failure else rehearsal.chains
 
 
-def _steps(rehearse: Rehearser, chain: Chain, actions: Sequence[Doing],
-           physical: dict[str, float]) -> tuple[tuple[Step, ...], Rehearsal]:
+def _steps(pool: Pool, chain: Chain, actions: Sequence[Doing],
+           physical: dict[str, float]) -> tuple[tuple[ActionStep, ...], Rehearsal]:
     """Return the actions as steps in turn, and their rehearsal with the found parameters."""
-    steps: list[Step] = []
+    steps: list[ActionStep] = []
     for action in actions:
         if isinstance(action, NamedAction):
             after = {hand for step in steps[-1:] for hand in step.held_by} - set(action.hand_names)
-            action = Together((action,), (*sorted(after), *(action.hand_names if action.hold else ())))
-        if isinstance(action, Together):
+            action = SimultaneousActions(
+                (action,), (*sorted(after), *(action.hand_names if action.hold else ())))
+        if isinstance(action, SimultaneousActions):
             before = chain
-            if steps and any(isinstance(one, NamedAction) for one in action.actions):
-                before = Chain(_rehearsed(rehearse, chain, steps, physical).chains[-1])
+            if steps and any(isinstance(part, NamedAction) for part in action.actions):
+                before = Chain(_rehearsed(pool, chain, steps, physical).chains[-1])
             steps.append(_combined(action, before, [step.action for step in in_turn(steps)]))
         else:
-            steps.append(action if isinstance(action, Step) else Step(action))
-    return in_turn(steps), _rehearsed(rehearse, chain, steps, physical)
+            steps.append(action if isinstance(action, ActionStep) else ActionStep(action))
+    return in_turn(steps), _rehearsed(pool, chain, steps, physical)
 
 
-def _combined(together: Together, before: Chain, earlier: Sequence[Action]) -> Step:
+def _combined(together: SimultaneousActions, before: Chain, earlier: Sequence[Action]) -> ActionStep:
     """
     Return one step for actions that overlap in time.
 
     :param before: the DLO then.
     :param earlier: the actions before, in turn.
     """
-    first = min(one.start for one in together.actions)
+    first = min(action.start for action in together.actions)
     begin = earlier[-1].end + PAUSE if earlier else 0.0
     hands: list[Hand] = []
-    for one in together.actions:
-        start = begin + one.start - first
-        paths = replace(one, start=start).action(before, earlier) if isinstance(one, NamedAction) else \
-            Step(one).starting(start).action
+    for action in together.actions:
+        start = begin + action.start - first
+        paths = replace(action, start=start).action(before, earlier) if isinstance(action, NamedAction) else \
+            ActionStep(action).starting(start).action
         hands += paths.hands
-    return Step(Action(tuple(hands)), together.held_by)
+    return ActionStep(Action(tuple(hands)), together.held_by)
 
 
-def _rehearsed(rehearse: Rehearser, chain: Chain, steps: Sequence[Step],
-               physical: dict[str, float]) -> Rehearsal:
-    found, = rehearse([Job(chain, tuple(steps), physical)])
-    if found.failure:
-        raise SimulationError(found.failure)
-    return found
+def _rehearsed(pool: Pool, chain: Chain, steps: Sequence[ActionStep], physical: dict[str, float]
+               ) -> Rehearsal:
+    rehearsal, = rehearse(pool, [RehearsalJob(chain, tuple(steps), physical)])
+    if rehearsal.failure:
+        raise SimulationError(rehearsal.failure)
+    return rehearsal
 
 
-def _name(action: Doing) -> str:
-    return action.name if isinstance(action, (NamedAction, Together)) else PATHS
+def plain_prediction(prediction: Prediction) -> dict[str, Any]:
+    """
+    Return a prediction as plain values, under the keys that `simulate --json` prints.
+
+    Lengths are in m, times in s.
+    """
+    values: dict[str, Any] = with_nulls({
+        'actions': [{**plain_action(prediction.start, step.name, step.step.action, step.chain, step.lower,
+                                    step.upper),
+                     'held_by': step.step.held_by, 'settled': step.settled} for step in prediction.steps],
+        'draws': prediction.draws, 'remarks': prediction.warnings})
+    return values

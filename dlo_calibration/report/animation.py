@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping, Sequence
 
@@ -13,13 +14,13 @@ import numpy as np
 from PIL.Image import Dither, fromarray, Image
 
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.quantity import number
+from dlo_calibration.model.parameters import number
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.report.drawing import hand_colours, numbered, View
+from dlo_calibration.report.drawing import hand_colours, View, write_numbered
 from dlo_calibration.report.figure import add_legend, as_text, blank_figure, OBSERVED, settings, SIMULATED
 from dlo_calibration.simulation.motion import FRAME_RATE, hands_at, Motion, simulated_motion
 from dlo_calibration.simulation.protocol import Simulator
-from dlo_calibration.writing import Attempts, whole
+from dlo_calibration.writing import whole
 
 DOTS_PER_INCH = 80  # enough to read the legend; more makes a large file
 PAUSE = 1600  # ms, to look at the end
@@ -74,14 +75,9 @@ def write_animations(trials: Sequence[Trial], simulator: Simulator, physical: Ma
     :raises DloCalibrationError: if files cannot be written; the others are.
     :raises SimulationError: if a trial cannot be simulated.
     """
-    paths, attempts = numbered(numbers, folder, '.gif'), Attempts(folder)
-    for trial, path in zip(trials, paths, strict=True):
-        motion = simulated_motion(trial, simulator, physical)
-        with attempts.attempt(path.name):
-            write_animation(trial, motion, path)
-            note(str(path))
-    attempts.require()
-    return paths
+    return write_numbered(
+        (partial(write_animation, trial, simulated_motion(trial, simulator, physical)) for trial in trials),
+        folder, '.gif', note, numbers)
 
 
 class _Scene:

@@ -10,13 +10,18 @@ from typing import Sequence, TYPE_CHECKING
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.model.bending import bending_moments, natural_curvature, rest_shape
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import BY_NAME
-from dlo_calibration.model.quantity import measured, number
+from dlo_calibration.model.parameters import (
+    bending_moments,
+    BY_NAME,
+    measured,
+    natural_curvature,
+    number,
+    rest_shape,
+)
 from dlo_calibration.planning.dlo import Posterior
-from dlo_calibration.report.bending_sentences import keeps_bends
 from dlo_calibration.report.figure import BAND, BLUE, FAINT, OBSERVED, Panel, panel, SIMULATED
+from dlo_calibration.report.sentences import keeps_bends
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 import math
 from pathlib import Path
-from typing import Callable, Mapping, Sequence, TYPE_CHECKING
+from typing import Callable, Iterable, Mapping, Sequence, TYPE_CHECKING
 
 import numpy as np
 
@@ -17,36 +18,18 @@ from dlo_calibration.evaluation.residuals import ResidualLayout
 from dlo_calibration.inference.uncertainty import DEVIATIONS
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Floats, grip_place
-from dlo_calibration.model.quantity import interval, measured, number
+from dlo_calibration.model.parameters import interval, measured, number
 from dlo_calibration.model.score import differences, PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
-from dlo_calibration.report.figure import (
-    add_legend,
-    as_text,
-    BAND,
-    BEFORE,
-    blank_figure,
-    BLUE,
-    FAINT,
-    GREEN,
-    MOST_TICKS,
-    OBSERVED,
-    Panel,
-    panel,
-    PURPLE,
-    settings,
-    SIMULATED,
-    SKY,
-    write_figure,
-    YELLOW,
-)
+from dlo_calibration.report import figure
 from dlo_calibration.report.sentences import MEAN_DISTANCE
 from dlo_calibration.writing import Attempts, make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-HAND_COLOURS = (GREEN, PURPLE, SKY, YELLOW, BLUE, '#882255', '#999933', '#44aa99')
+HAND_COLOURS = (figure.GREEN, figure.PURPLE, figure.SKY, figure.YELLOW, figure.BLUE,
+                '#882255', '#999933', '#44aa99')
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a square, in turn
 SAME_PLACE = 0.005  # of the length: mean distance up to which two goals show the same rest
 INSTANT_COLOURS = ('#440154', '#3b6bb5', '#21918c', '#5ec962', '#e0b400')  # of goals in motion, early to late
@@ -73,9 +56,9 @@ class Drawn:
     @classmethod
     def of(cls, result: CalibrationResult, k: int) -> Drawn:
         """Return the k-th trial of a result."""
-        trial, found = result.trials[k], result.examination
+        trial, examination = result.trials[k], result.examination
         drawn = cls(trial, result.chains[k], hand_colours([trial]),
-                    math.nan if found is None else found.noise)
+                    math.nan if examination is None else examination.noise)
         if result.band is None:
             return drawn
         by_goal = ResidualLayout.of(result.trials).by_point(result.band)[k]
@@ -123,23 +106,23 @@ def session_picture(trials: Sequence[Trial], chains: Sequence[Floats] | None, pa
     # The colours of several goals belong to one trial, so that each row needs its own legend.
     several = any(len(trial.goals) > 1 for trial in trials)
     lines = (2 + len(colours) + 2 * several) * (len(trials) if several else 1)
-    with settings():
-        figure = blank_figure(14, 4.3 * len(trials) + 0.25 * lines)
-        rows = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
+    with figure.settings():
+        whole = figure.blank_figure(14, 4.3 * len(trials) + 0.25 * lines)
+        rows = whole.subfigures(len(trials), 1, squeeze=False)[:, 0]
         explained: list[Axes] = []
         for k, (trial, row) in enumerate(zip(trials, rows, strict=True)):
             drawn = Drawn(trial, None if chains is None else chains[k], colours)
-            row.suptitle(as_text(_title(drawn)), fontweight='bold')
+            row.suptitle(figure.as_text(_title(drawn)), fontweight='bold')
             above, side, error = row.subplots(1, 3)
             draw_view(above, drawn, above=True)
             draw_view(side, drawn, above=False)
             draw_errors(error, drawn)
             explained += [above, error]
             if several:
-                add_legend(row, [above, error])
+                figure.add_legend(row, [above, error])
         if not several:
-            add_legend(figure, explained)
-        write_figure(figure, path)
+            figure.add_legend(whole, explained)
+        figure.write_figure(whole, path)
 
 
 def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, folder: Path,
@@ -151,22 +134,30 @@ def write_pictures(trials: Sequence[Trial], chains: Sequence[Floats] | None, fol
     :param numbers: of the trials.
     :raises DloCalibrationError: if files cannot be written; the others are.
     """
-    paths, attempts = numbered(numbers, folder, '.png'), Attempts(folder)
-    for k, (trial, path) in enumerate(zip(trials, paths, strict=True)):
+    return write_numbered(
+        (partial(session_picture, [trial], None if chains is None else [chains[k]])
+         for k, trial in enumerate(trials)), folder, '.png', note, numbers)
+
+
+def write_numbered(writers: Iterable[Callable[[Path], None]], folder: Path, suffix: str,
+                   note: Callable[[str], None], numbers: Sequence[int]) -> list[Path]:
+    """
+    Write a file for each trial, numbered because names may contain anything; create the folder.
+
+    :param writers: of the files; an error from the iterable itself is raised.
+    :raises DloCalibrationError: if files cannot be written; the others are.
+    """
+    make_folder(folder)
+    paths, attempts = [folder / f'trial_{number}{suffix}' for number in numbers], Attempts(folder)
+    for write, path in zip(writers, paths, strict=True):
         with attempts.attempt(path.name):
-            session_picture([trial], None if chains is None else [chains[k]], path)
+            write(path)
             note(str(path))
     attempts.require()
     return paths
 
 
-def numbered(numbers: Sequence[int], folder: Path, suffix: str) -> list[Path]:
-    """Return a path for each trial, numbered because names may contain anything; create the folder."""
-    make_folder(folder)
-    return [folder / f'trial_{number}{suffix}' for number in numbers]
-
-
-def trial_panels(drawn: Drawn) -> list[Panel]:
+def trial_panels(drawn: Drawn) -> list[figure.Panel]:
     """Draw a trial for the page: from above, from the side, point errors, and residuals by coordinate."""
     name, chains = drawn.trial.name, drawn.chains
     assert chains is not None
@@ -174,14 +165,14 @@ def trial_panels(drawn: Drawn) -> list[Panel]:
     by_axis = (f'{axis}: {interval(np.nanmin(values), np.nanmax(values), "m")}'
                for axis, values in zip('xyz', off[-1].T, strict=True))
     return [
-        panel(lambda axes: draw_view(axes, drawn, above=True),
+        figure.panel(lambda axes: draw_view(axes, drawn, above=True),
               f'{name} seen from above: the measured and the simulated chain'),
-        panel(lambda axes: draw_view(axes, drawn, above=False),
+        figure.panel(lambda axes: draw_view(axes, drawn, above=False),
               f'{name} seen from the side: the measured and the simulated chain', legend=False),
-        panel(lambda axes: draw_errors(axes, drawn),
+        figure.panel(lambda axes: draw_errors(axes, drawn),
               f'{name}, error of each point: the mean is {measured(errors.mean, "m")}, '
               f'the largest {measured(errors.max, "m")}'),
-        panel(lambda axes: _draw_differences(axes, drawn),
+        figure.panel(lambda axes: _draw_differences(axes, drawn),
               f'{name}, residuals by coordinate: {", ".join(by_axis)}')]
 
 
@@ -220,7 +211,7 @@ class View:
             axes.set(title='seen from the side', xlabel=f'{where} [m]', ylabel='z (up) [m]')
         axes.set_aspect('equal', adjustable='datalim')
         axes.margins(0.12)
-        axes.locator_params(axis='x', nbins=MOST_TICKS)
+        axes.locator_params(axis='x', nbins=figure.MOST_TICKS)
         axes.grid(alpha=0.3)
 
     def flat(self, points: Floats) -> Floats:
@@ -230,8 +221,8 @@ class View:
 
     def draw_start(self, label: str = 'before the action, measured') -> None:
         """Draw the DLO before the action."""
-        self.axes.plot(*self.flat(self.trial.initial.points), '-', color=BEFORE, linewidth=3, label=label,
-                       zorder=1)
+        self.axes.plot(*self.flat(self.trial.initial.points), '-', color=figure.BEFORE, linewidth=3,
+                       label=label, zorder=1)
 
     def draw_band(self, lower: Floats, upper: Floats, label: str) -> None:
         """
@@ -248,7 +239,8 @@ class View:
         swept = np.stack([corners[:-1], after[:-1], after[1:], corners[1:]], axis=2).reshape(-1, 4, 2)
         # One colour without transparency, as the pieces overlap; edges close the gaps between them.
         self.axes.add_collection(PolyCollection(
-            [*corners, *swept], facecolor=BAND, edgecolor=BAND, linewidth=0.3, zorder=0.5, label=label))
+            [*corners, *swept], facecolor=figure.BAND, edgecolor=figure.BAND, linewidth=0.3, zorder=0.5,
+            label=label))
 
     def draw_goal(self, index: int, simulated: Floats | None, colour: str | None) -> None:
         """
@@ -260,21 +252,22 @@ class View:
         goal = self.trial.goals[index]
         seen = self.flat(goal.chain.observed)
         when = 'after the action' if colour is None else f'after {number(goal.time)} s'
-        self.axes.plot(*seen, 'o', color=colour or OBSERVED, markersize=4.5, linestyle='none',
+        self.axes.plot(*seen, 'o', color=colour or figure.OBSERVED, markersize=4.5, linestyle='none',
                        label=f'{when}, measured', zorder=3)
         if simulated is None:
             return
         shown = self.flat(simulated)
-        self.axes.plot(*shown, '-', color=colour or SIMULATED, linewidth=2, zorder=2,
+        self.axes.plot(*shown, '-', color=colour or figure.SIMULATED, linewidth=2, zorder=2,
                        label=f'{when}, simulated')
         pairs = np.stack([seen, shown, np.full(seen.shape, np.nan)], axis=2).reshape(2, -1)
-        self.axes.plot(*pairs, '-', zorder=2, linewidth=0.7, color=colour or SIMULATED, alpha=0.6,
+        self.axes.plot(*pairs, '-', zorder=2, linewidth=0.7, color=colour or figure.SIMULATED, alpha=0.6,
                        label=None if colour else 'one point, measured and simulated')
 
     def draw_first_point(self) -> None:
         """Mark the first point of the DLO."""
         self.axes.plot(*self.flat(self.trial.initial.points[:1]), 'o', markersize=11, markerfacecolor='none',
-                       markeredgecolor=OBSERVED, linestyle='none', zorder=6, label='first point of the DLO')
+                       markeredgecolor=figure.OBSERVED, linestyle='none', zorder=6,
+                        label='first point of the DLO')
 
     def draw_hands(self, colours: Mapping[str, str]) -> None:
         """Draw the paths of the hands, with their first and last points."""
@@ -282,9 +275,9 @@ class View:
             colour, path = colours[hand.name], hand_path(hand)
             self.axes.plot(*self.flat(path), '--', color=colour, linewidth=1, zorder=4)
             self.axes.plot(*self.flat(path[:1]), 's', color=colour, markersize=6, zorder=4, linestyle='none',
-                           label=as_text(f'{hand.name} closes'))
+                           label=figure.as_text(f'{hand.name} closes'))
             self.axes.plot(*self.flat(path[-1:]), '^', color=colour, markersize=8, zorder=5, linestyle='none',
-                           label=as_text(f'{hand.name} at its last waypoint'))
+                           label=figure.as_text(f'{hand.name} at its last waypoint'))
 
 
 def draw_view(axes: Axes, drawn: Drawn, *, above: bool) -> None:
@@ -305,22 +298,22 @@ def draw_errors(axes: Axes, drawn: Drawn) -> None:
         seen = trial.goals[goal].chain.observed
         other = trial.initial.points if chains is None else chains[goal]
         axes.plot(places, np.linalg.norm(seen - other, axis=1) * 1e3, 'o-', markersize=4, linewidth=1,
-                  color=colour or (OBSERVED if chains is None else SIMULATED),
+                  color=colour or (figure.OBSERVED if chains is None else figure.SIMULATED),
                   label=None if colour is None else f'after {number(trial.goals[goal].time)} s')
     if chains is not None:
         mean = PointErrors.of(residuals(trial, chains)).mean * 1e3
-        axes.axhline(mean, color=SIMULATED, linestyle=':', linewidth=1.2, label='mean error')
+        axes.axhline(mean, color=figure.SIMULATED, linestyle=':', linewidth=1.2, label='mean error')
     if math.isfinite(drawn.noise):
-        axes.axhline(drawn.noise * MEAN_DISTANCE * 1e3, color=FAINT, linestyle=(0, (6, 3)), linewidth=1.2,
-                     label='error from the noise of the measured points alone')
+        axes.axhline(drawn.noise * MEAN_DISTANCE * 1e3, color=figure.FAINT, linestyle=(0, (6, 3)),
+                     linewidth=1.2, label='error from the noise of the measured points alone')
     if drawn.band is not None:
-        axes.fill_between(places, 0.0, drawn.band * 1e3, color=BLUE, alpha=0.25, linewidth=0, label=(
+        axes.fill_between(places, 0.0, drawn.band * 1e3, color=figure.BLUE, alpha=0.25, linewidth=0, label=(
             'error of a simulated point from the uncertainty of the parameters (one standard deviation)'))
     for hand in trial.hands:
         for k, grip in enumerate(hand.grips):
             axes.axvline(grip_place(places, grip, hand.offset), color=drawn.colours[hand.name],
                          linestyle='--', linewidth=1,
-                         label=None if k else as_text(f'place that {hand.name} grips'))
+                         label=None if k else figure.as_text(f'place that {hand.name} grips'))
     axes.set(xlabel='arc length from the first point [m]',
              ylabel='distance [mm]',
              title='how far each point moved' if chains is None else 'distance from measured to simulated')
@@ -335,11 +328,11 @@ def _draw_differences(axes: Axes, drawn: Drawn) -> None:
     places = trial.initial.arc_lengths()
     if math.isfinite(drawn.noise):
         reach = DEVIATIONS * drawn.noise * 1e3
-        axes.axhspan(-reach, reach, color=FAINT, alpha=0.25, linewidth=0,
+        axes.axhspan(-reach, reach, color=figure.FAINT, alpha=0.25, linewidth=0,
                      label='noise of the measured points (90 % interval)')
     for axis, values, colour, dashes in zip(
-            ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.observed).T, (BLUE, YELLOW, GREEN),
-            ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
+            ('x', 'y', 'z, up'), (drawn.chains[-1] - goal.chain.observed).T,
+            (figure.BLUE, figure.YELLOW, figure.GREEN), ('-', (0, (5, 1)), (0, (2, 1))), strict=True):
         axes.plot(places, values * 1e3, color=colour, linestyle=dashes, linewidth=1.8, label=f'in {axis}')
     last = '' if len(trial.goals) == 1 else f', after {number(goal.time)} s'
     axes.set(xlabel='arc length from the first point [m]', ylabel='simulated minus measured [mm]',

@@ -12,8 +12,7 @@ import numpy as np
 from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.slices import Line, Plane
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.model.parameters import SCALE
-from dlo_calibration.model.quantity import number
+from dlo_calibration.model.parameters import number, SCALE
 from dlo_calibration.report.figure import BEFORE, BLUE, FAINT, OBSERVED, Panel, panel, PURPLE, SIMULATED
 
 if TYPE_CHECKING:
@@ -57,18 +56,18 @@ def plane_panels(result: CalibrationResult, plane: Plane) -> list[Panel]:
 
 
 def _line(result: CalibrationResult, line: Line, legend: bool) -> Panel:
-    found = result.parameters[line.name]
+    estimate = result.parameters[line.name]
     # A result that fits exactly would make the ratios infinite.
     errors = line.errors / max(result.errors.rms, 1e-6)
     scores = line.scores / max(result.best.score, 1e-2)
 
     def draw(axes: Axes) -> None:
-        axes.axvspan(*np.clip([found.lower, found.upper], line.values[0], line.values[-1]), color=BEFORE,
-                     alpha=0.4, linewidth=0, label='90 % interval')
+        axes.axvspan(*np.clip([estimate.lower, estimate.upper], line.values[0], line.values[-1]),
+                     color=BEFORE, alpha=0.4, linewidth=0, label='90 % interval')
         axes.plot(line.values, _visible(scores), '--', color=FAINT, label='difference score')
         axes.plot(line.values, _visible(errors), '.-', color=BLUE, linewidth=1.8,
                   label='root mean square error of the points')
-        _mark(axes, found.value, 1.0)
+        _mark(axes, estimate.value, 1.0)
         axes.set(title=f'along {line.name}', xlabel=f'{line.name} [0 to 100]',
                  ylabel='multiple of the value at the result')
         _logarithmic(axes, 0.8, 1.25)
@@ -106,11 +105,11 @@ def _plane(result: CalibrationResult, plane: Plane, what: str, unit: str, values
 
 def _region(result: CalibrationResult, plane: Plane) -> Floats | None:
     """Return the border of the 90 % region of both parameters, (2, k) on the 0..100 scale; None: unknown."""
-    found = result.examination
-    if found is None or not found.regular or found.uncertainty.covariance is None:
+    examination = result.examination
+    if examination is None or not examination.regular or examination.uncertainty.covariance is None:
         return None
     chosen = [result.space.free.index(name) for name in plane.names]
-    values, vectors = np.linalg.eigh(found.uncertainty.covariance[np.ix_(chosen, chosen)])
+    values, vectors = np.linalg.eigh(examination.uncertainty.covariance[np.ix_(chosen, chosen)])
     radius = np.sqrt(-2 * np.log(0.1))  # holds 90 % of a normal distribution in two dimensions
     angles = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(angles), np.sin(angles)])

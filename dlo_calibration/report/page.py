@@ -5,32 +5,33 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
-import hashlib
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
 import platform
 import shlex
-from typing import Any, Callable, Iterable, Mapping, Sequence, TYPE_CHECKING
+from typing import Any, Mapping, Sequence, TYPE_CHECKING
 
-from dlo_calibration.calibration.file_options import recordable
-from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.calibration.plain import plain
-from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.options import Options, recordable
+from dlo_calibration.calibration.result import CalibrationResult, plain
 from dlo_calibration.errors import printable
 from dlo_calibration.inference.slices import Slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.model.quantity import exact, measured, number
+from dlo_calibration.model.parameters import exact, measured, number
 from dlo_calibration.model.score import PointErrors, residuals, SIMILAR, VERY_SIMILAR
 from dlo_calibration.report.bending_drawing import moment_panels, rest_shape_panels
 from dlo_calibration.report.drawing import Drawn, trial_panels
 from dlo_calibration.report.landscape import convergence_panel, line_panels, plane_panels
-from dlo_calibration.report.rows import fit_facts, parameter_rows
-from dlo_calibration.report.sentences import lower_score, MEAN_DISTANCE, sentences, verdict
-from dlo_calibration.writing import whole
+from dlo_calibration.report.sentences import (
+    fit_facts,
+    lower_score,
+    MEAN_DISTANCE,
+    parameter_rows,
+    sentences,
+    verdict,
+)
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -65,54 +66,12 @@ def repeating_command(session: str, options: Options, selection: Sequence[str] =
                        *(word for name, value in changed.items() for word in as_flags(name, value))])
 
 
-def digests(paths: Iterable[Path]) -> dict[str, str]:
-    """
-    Return the SHA-256 of files, by their name without folders.
-
-    :raises OSError: if a file cannot be read.
-    """
-    found = {}
-    for path in paths:
-        with path.open('rb') as stream:
-            found[path.name] = hashlib.file_digest(stream, 'sha256').hexdigest()
-    return found
-
-
-def write_report(path: Path, result: CalibrationResult, origin: Origin,
-                 simulate_slices: Callable[[], Slices | None] = lambda: None) -> None:
-    """
-    Write the page as one file, which needs no other file and no network.
-
-    :param simulate_slices: see `page_of`.
-    :raises InputError: if the file cannot be written.
-    """
-    write_page(path, page_of(result, origin, simulate_slices))
-
-
-def write_page(path: Path, page: str) -> None:
-    """
-    Write a page.
-
-    :raises InputError: if the file cannot be written.
-    """
-    with whole(path) as new:
-        new.write_text(page, encoding='utf-8')
-
-
-def page_of(result: CalibrationResult, origin: Origin,
-            simulate_slices: Callable[[], Slices | None] = lambda: None) -> str:
+def page_of(result: CalibrationResult, origin: Origin, slices: Slices | None = None) -> str:
     """
     Return the page, which needs no other file and no network.
 
-    :param simulate_slices: returns slices through the found values, None: the page has none; called in a
-        thread of its own, while this one draws the other pictures.
+    :param slices: through the best parameter set; None: the page has none.
     """
-    with ThreadPoolExecutor(1) as thread:
-        pending = thread.submit(simulate_slices)
-        drawn = {'rest_shapes': rest_shape_panels(result), 'moments': moment_panels(result),
-                 'convergence': convergence_panel(result), **_trials(result)}
-        slices = pending.result()
-
     values = plain(result)
     return _template().render(
         values=values, result=result, origin=origin, slices=slices, sentences=sentences(result),
@@ -121,14 +80,15 @@ def page_of(result: CalibrationResult, origin: Origin,
         correlated=most_correlated(values['correlations']),
         marks={IDENTIFIABLE: 'good', WEAK: 'weak', NOT_IDENTIFIABLE: 'bad', '': ''},  # classes of the style
         similar=SIMILAR, very_similar=VERY_SIMILAR, errors=_errors(result, values), facts=fit_facts(values),
-        **drawn, lower_score=lower_score(result),
+        rest_shapes=rest_shape_panels(result), moments=moment_panels(result),
+        convergence=convergence_panel(result), **_trials(result), lower_score=lower_score(result),
         lines=[] if slices is None else line_panels(result, slices.lines),
         planes=[] if slices is None else [(one.names, plane_panels(result, one)) for one in slices.planes],
         versions={name: _version(name) for name in
                   ('dlo_calibration', 'numpy', 'scipy', 'pybullet')},
         system=f'{platform.python_version()}, {platform.system()} {platform.machine()}',
         changed=_changed(origin.options), defaults=Options().flat(), options=origin.options.flat(),
-        declarations=list(declarations()))
+        declarations=list(Options.declarations()))
 
 
 @cache

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drawings of a plan: a picture with a panel an action, and an animation of all actions."""
+"""Drawings of plans and predictions: a picture of each action, and an animation of all actions."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dataclasses import replace
 import math
 from pathlib import Path
 import textwrap
-from typing import Collection, Mapping, Sequence
+from typing import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain, Floats
-from dlo_calibration.model.quantity import measured, number
-from dlo_calibration.model.trial import Goal, Trial
+from dlo_calibration.model.trial import Goal, shown_goals, Trial
 from dlo_calibration.planning.plan import Plan, PlannedAction
-from dlo_calibration.planning.rehearsal import rehearsed_trial, Step
+from dlo_calibration.planning.prediction import PredictedStep, Prediction
+from dlo_calibration.planning.rehearsal import ActionStep, motion_of_actions, rehearsed_trial
 from dlo_calibration.report.animation import Captions, write_animation
 from dlo_calibration.report.drawing import hand_colours, View
 from dlo_calibration.report.figure import (
@@ -30,8 +30,8 @@ from dlo_calibration.report.figure import (
     SIMULATED,
     write_figure,
 )
-from dlo_calibration.report.plan_sentences import distance
-from dlo_calibration.simulation.motion import simulated_motion
+from dlo_calibration.report.sentences import distance, of_length, width
+from dlo_calibration.simulation.motion import MOST_FRAMES, simulated_motion
 from dlo_calibration.simulation.protocol import Simulator
 
 COLUMNS = 3  # of panels, at most
@@ -56,12 +56,14 @@ def write_plan_picture(plan: Plan, path: str | Path) -> None:
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
         for one in panels[len(trials):]:
             one.remove()
-        everything = _extent(plan)
+        everything = _extent([plan.start.points, plan.goal.points], plan.actions,
+                             (hand for one in plan.actions for hand in one.action.hands))
         for k, (axes, trial) in enumerate(zip(panels, trials, strict=False)):
             view = View(axes, trial, above=True)
             view.draw_start('before the action' if plan.actions else 'the DLO')
             if plan.actions:
-                _draw_action(view, plan.actions[k], colours)
+                _draw_predicted(view, plan.actions[k], plan.actions[k].predicted)
+                _draw_ways(view, plan.actions[k].action.hands, colours)
                 axes.set_title(as_text(f'{k + 1}. {plan.actions[k].name}: then '
                                        f'{distance(plan, plan.actions[k].predicted)} from the goal'),
                                fontsize=10)
@@ -89,7 +91,7 @@ def write_plan_animation(plan: Plan, simulator: Simulator, physical: Mapping[str
 
 def plan_trial(plan: Plan) -> Trial:
     """Return a trial with the actions of a plan, at least one, in turn; each goal is that of the plan."""
-    trial = rehearsed_trial(plan.start, [Step(one.action) for one in plan.actions])
+    trial = rehearsed_trial(plan.start, [ActionStep(one.action) for one in plan.actions])
     goal = Chain(plan.goal.points)  # an object of its own, also where the start is the goal
     return replace(trial, name='plan', goals=tuple(replace(one, chain=goal) for one in trial.goals))
 
@@ -104,22 +106,21 @@ def _trials(plan: Plan) -> list[Trial]:
                           [one.action for one in plan.actions] or [nothing], strict=True))]
 
 
-def _extent(plan: Plan) -> Floats:
-    """Return points, (m, 3) [m], among which all that a plan contains lies."""
-    return np.concatenate([plan.start.points, plan.goal.points,
-                           *(part for one in plan.actions for part in (one.lower, one.upper)),
-                           *(hand.positions for one in plan.actions for hand in one.action.hands)])
+def _extent(chains: Sequence[Floats], steps: Sequence[PlannedAction | PredictedStep],
+            hands: Iterable[Hand]) -> Floats:
+    """Return points, (m, 3) [m], among which all of these lie."""
+    return np.concatenate([*chains, *(part for one in steps for part in (one.lower, one.upper)),
+                           *(hand.positions for hand in hands)])
 
 
-def _draw_action(view: View, planned: PlannedAction, colours: Mapping[str, str]) -> None:
-    """Draw the DLO as predicted after an action, and the ways of the hands."""
-    view.draw_band(planned.lower, planned.upper, '90 % interval of its points')
-    view.axes.plot(*view.flat(planned.predicted), '-', color=SIMULATED, linewidth=2.2, zorder=3,
+def _draw_predicted(view: View, step: PlannedAction | PredictedStep, predicted: Floats) -> None:
+    """Draw the DLO as predicted after an action, (n, 3) [m], with its intervals."""
+    view.draw_band(step.lower, step.upper, '90 % interval of its points')
+    view.axes.plot(*view.flat(predicted), '-', color=SIMULATED, linewidth=2.2, zorder=3,
                    label='after the action, predicted')
-    draw_ways(view, planned.action.hands, colours)
 
 
-def draw_ways(view: View, hands: Sequence[Hand], colours: Mapping[str, str],
+def _draw_ways(view: View, hands: Sequence[Hand], colours: Mapping[str, str],
               holding: Collection[str] = ()) -> None:
     """
     Draw the ways of hands, with arrows, and where they close and open.
@@ -149,10 +150,60 @@ def _draw_goal(view: View) -> None:
 
 
 def _title(plan: Plan) -> str:
-    length = plan.start.length
-    before = f'{measured(plan.error_before, "m")} ({number(100 * plan.error_before / length)} %)'
+    before = of_length(plan, plan.error_before)
     if not plan.actions:
         return f'no action: the DLO is {before} from the goal'
-    after = f'{measured(plan.error_after, "m")} ({number(100 * plan.error_after / length)} % of the length)'
+    after = of_length(plan, plan.error_after).replace('%', '% of the length')
     count = f'{len(plan.actions)} action{"s" if len(plan.actions) > 1 else ""}'
     return f'{count}: from {before} to {after} from the goal'
+
+
+def write_prediction_picture(prediction: Prediction, name: str, path: str | Path) -> None:
+    """
+    Write a PNG with a row an action, seen from above and from the side; of many actions, five are shown.
+
+    :param name: of the trial.
+    :raises InputError: if the file cannot be written.
+    """
+    before = [prediction.start.points, *(step.chain for step in prediction.steps)]
+    trials = [Trial(name, Chain(chain), (step.step.action,),
+                    (Goal(Chain(step.chain), step.step.action.end + 1.0),))
+              for chain, step in zip(before, prediction.steps, strict=False)]
+    colours, shown = hand_colours(trials), shown_goals(len(trials))
+    everything = _extent([prediction.start.points], prediction.steps,
+                         (hand for one in prediction.steps for hand in one.step.action.hands))
+    with settings():
+        figure = blank_figure(11, 3.9 * len(shown) + 1.0)
+        figure.suptitle(as_text(f'{name}, predicted'), fontweight='bold')
+        rows = figure.subfigures(len(shown), 1, squeeze=False)[:, 0]
+        panels = []
+        for k, row in zip(shown, rows, strict=True):
+            step = prediction.steps[k]
+            row.suptitle(as_text(f'{k + 1}. {step.name}: then the 90 % intervals are {width(step)} wide '
+                                 'on average'), fontsize=11)
+            for axes, above in zip(row.subplots(1, 2), (True, False), strict=True):
+                view = View(axes, trials[k], above=above, extent=everything)
+                view.draw_start('before the action')
+                _draw_predicted(view, step, step.chain)
+                _draw_ways(view, step.step.action.hands, colours, step.step.held_by)
+                view.draw_first_point()
+                axes.update_datalim(view.flat(everything).T)  # the same section in all rows
+                axes.autoscale_view()
+                panels.append(axes)
+        add_legend(figure, panels, columns=3)
+        write_figure(figure, path)
+
+
+def write_prediction_animation(prediction: Prediction, name: str, simulator: Simulator,
+                               path: str | Path) -> None:
+    """
+    Simulate the actions of a prediction again, and write their motion as a GIF.
+
+    :raises InputError: if the file cannot be written.
+    :raises SimulationError: if the simulation diverges.
+    """
+    trial, motion = motion_of_actions(prediction.start, [one.step for one in prediction.steps], simulator,
+                                      prediction.physical, most=MOST_FRAMES)
+    write_animation(trial, motion, path, Captions(f'{name}, simulated', 'start', ''))
+
+

@@ -1,9 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sentences: the result of a calibration in plain English."""
+"""Sentences: results, plans and predictions in plain English, and the texts of their tables."""
 
 from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Mapping, TYPE_CHECKING
 
 import numpy as np
 
@@ -11,13 +15,28 @@ from dlo_calibration.calibration.result import CalibrationResult
 from dlo_calibration.inference.missing_parameters import PARTS
 from dlo_calibration.inference.trial_information import uninformative
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, MODEL_ERROR, NOT_IDENTIFIABLE, WEAK
-from dlo_calibration.model.parameters import BY_NAME, knot_names, PER_WEIGHT, SCALE
-from dlo_calibration.model.quantity import measured, number
-from dlo_calibration.report.bending_sentences import friction_sentences, rest_shape_sentences
+from dlo_calibration.model.action import Hand
+from dlo_calibration.model.chain import Chain, Floats, grip_place
+from dlo_calibration.model.parameters import (
+    BY_NAME,
+    interval,
+    knot_names,
+    measured,
+    natural_curvature,
+    number,
+    ParameterSpace,
+    PER_WEIGHT,
+    SCALE,
+)
+from dlo_calibration.model.score import SIMILAR, VERY_SIMILAR
+
+if TYPE_CHECKING:
+    from dlo_calibration.planning.plan import Plan
+    from dlo_calibration.planning.prediction import PredictedStep, Prediction
 
 #: Mean length of a vector of three normal coordinates with standard deviation 1 (Maxwell distribution).
 MEAN_DISTANCE = float(np.sqrt(8 / np.pi))
-MOST_COMBINATIONS = 3  # of parameters that the trials do not determine are told
+MOST_COMBINATIONS = 3  # of parameters that the trials do not determine, in sentences
 
 
 def verdict(result: CalibrationResult) -> str:
@@ -34,7 +53,7 @@ def sentences(result: CalibrationResult) -> list[str]:
 
 def _known(result: CalibrationResult) -> list[str]:
     """Return a sentence on each parameter but the knots of the rest shape, the most certain ones first."""
-    found: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
+    by_verdict: dict[str, list[str]] = {IDENTIFIABLE: [], WEAK: [], NOT_IDENTIFIABLE: []}
     alone = [name for name in result.parameters if name not in knot_names(result.space.knots)]
     for name in alone:
         p = result.parameters[name]
@@ -53,8 +72,8 @@ def _known(result: CalibrationResult) -> list[str]:
         else:
             well = 'well' if verdict == IDENTIFIABLE else 'only roughly'
             words = f'{name} is known {well}: {quantity} {value}, with 90 % probability {ends}'
-        found[verdict].append(f'{words}.')
-    texts = [text for group in found.values() for text in group]
+        by_verdict[verdict].append(f'{words}.')
+    texts = [text for group in by_verdict.values() for text in group]
     if any(p.physical_unit.endswith(PER_WEIGHT) for p in result.parameters.values()):
         texts.append('The mass was not given, so that stiffnesses are known only relative to the weight of '
                      'the DLO: multiply each by the weight per length, in N/m.')
@@ -65,10 +84,11 @@ def _known(result: CalibrationResult) -> list[str]:
 
 
 def _undetermined(result: CalibrationResult) -> list[str]:
-    found = result.undetermined
-    more = [f'So can {len(found) - MOST_COMBINATIONS} more combinations.'] * (len(found) > MOST_COMBINATIONS)
+    combinations = result.undetermined
+    more = len(combinations) - MOST_COMBINATIONS
     return [*(f'This combination of parameters can change while the fit stays nearly the same: {words}.'
-              for words in found[:MOST_COMBINATIONS]), *more]
+              for words in combinations[:MOST_COMBINATIONS]),
+            *([f'So can {more} more combinations.'] if more > 0 else [])]
 
 
 def _uninformative(result: CalibrationResult) -> list[str]:
@@ -87,17 +107,18 @@ def _advice(result: CalibrationResult) -> list[str]:
 
 def _fit(result: CalibrationResult) -> list[str]:
     """Compare the error of the fit with other errors."""
-    found, mean = result.examination, result.errors.mean
+    examination, mean = result.examination, result.errors.mean
     words = [f'The simulated points are {measured(mean, "m")} from the measured ones on average '
              f'({number(100 * mean / result.length)} % of the length).']
-    if found is None:
+    if examination is None:
         return words
-    if np.isfinite(found.default_error):
-        words.append(f'With the default parameters they would be {measured(found.default_error, "m")} away.')
-    if np.isfinite(found.cross_validated):
+    if np.isfinite(examination.default_error):
+        words.append('With the default parameters they would be '
+                     f'{measured(examination.default_error, "m")} away.')
+    if np.isfinite(examination.cross_validated):
         words.append('A trial that is left out of the fit is predicted to '
-                     f'{measured(found.cross_validated, "m")}.')
-    noise = found.noise * MEAN_DISTANCE
+                     f'{measured(examination.cross_validated, "m")}.')
+    noise = examination.noise * MEAN_DISTANCE
     if np.isfinite(noise):
         words.append(f'The noise of the measured points alone gives {measured(noise, "m")}; ' + (
             'the fit is about as good as the measurement.' if mean < MODEL_ERROR * noise else
@@ -127,3 +148,232 @@ def _missing_parameters(result: CalibrationResult) -> list[str]:
     how += ['set parts to 0 (bending stiffness that differs along the DLO)'] * (len(names) < len(shares))
     return [f'Parameters that were held fixed would explain these shares of the squared residuals: '
             f'{", ".join(shares)}. To calibrate them, too, {"; or ".join(how)}.']
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One parameter in words, or both components of the curvature at a knot.
+
+    :param name: for people; that of a knot names both components.
+
+    :param value: on the 0..100 scale, with its interval `ends`.
+    :param physical: the same in physical units, with its interval `physical_ends`.
+    :param verdict: of the less certain component.
+    :param note: a remark; may be empty.
+    """
+
+    name: str
+    quantity: str
+    value: str
+    ends: str
+    physical: str
+    physical_ends: str
+    verdict: str
+    note: str
+
+
+def parameter_rows(parameters: Mapping[str, Mapping[str, Any]], space: ParameterSpace) -> list[Row]:
+    """Return the rows for the parameters in the plain values of a result."""
+    rows, names = [], knot_names(space.knots)
+    pairs = dict(zip(names[::2], names[1::2], strict=True))
+    for name, one in parameters.items():
+        if name in pairs and pairs[name] in parameters:
+            place = number(100 * (int(name[-1]) - 1) / (space.knots - 1))
+            rows.append(_knot(f'rest_curvature {name[-1]}', f'at {place} % of the length, x and y',
+                              one, parameters[pairs[name]]))
+        elif not any(name == second and first in parameters for first, second in pairs.items()):
+            unit = one['physical_unit']
+            rows.append(Row(
+                name, BY_NAME[name].quantity, number(one['value']), interval(one['lower'], one['upper'], '1'),
+                measured(one['physical_value'], unit),
+                BY_NAME[name].interval(one['lower'], one['upper'],
+                                       (one['physical_lower'], one['physical_upper']), unit),
+                one['verdict'], one['note']))
+    return rows
+
+
+def _knot(name: str, quantity: str, *pair: Mapping[str, Any]) -> Row:
+    unit = pair[0]['physical_unit']
+
+    def ends(prefix: str) -> str:
+        """Return how far the intervals reach, to the wider side."""
+        return ', '.join(f'±{number(max(one[f"{prefix}upper"] - value, value - one[f"{prefix}lower"]))}'
+                         for one in pair for value in (one[f'{prefix}value'],))
+
+    x, y = pair
+    return Row(
+        name, quantity, f'{number(x["value"])}, {number(y["value"])}', ends(''),
+        f'{number(x["physical_value"])}, {measured(y["physical_value"], unit)}',
+        f'{ends("physical_")} {unit}',
+        max(pair, key=lambda one: float(one['std']))['verdict'],
+        '; '.join(dict.fromkeys(one['note'] for one in pair if one['note'])))
+
+
+def fit_facts(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return facts about the fit and the search, as pairs of texts, from the plain values of a result."""
+    facts = [
+        ('difference score', f'{number(values["score"])} cm (below {SIMILAR:g}: similar, '
+                             f'below {VERY_SIMILAR:g}: very similar)'),
+        ('mean error', f'{measured(values["mean_error_m"], "m")} '
+                       f'({number(values["error_percent_of_length"])} % of the length)'),
+        ('rms error', measured(values['rms_error_m'], 'm')),
+        ('largest error', measured(values['max_error_m'], 'm')),
+        ('trials', str(values['trials'])),
+        ('evaluations', f'{values["evaluations"]} ({values["simulations"]} simulations) '
+                        f'in {number(values["seconds"])} s'),
+        ('search', f'{values["search"] or "-"}, seed {"-" if values["seed"] is None else values["seed"]}'),
+        ('engine', values['engine'])]
+    other = values['confirmation']
+    if other is not None:
+        facts.append((
+            f'confirmed by {other["engine"]}',
+            f'difference score {number(other["score"])} cm, '
+            f'mean error {measured(other["mean_error_m"], "m")}; '
+            f'points {measured(other["mean_distance_m"], "m")} from those of {values["engine"]}, '
+            f'{measured(other["max_distance_m"], "m")} at most'))
+    return [*facts, ('ended', values['stop_reason'])]
+
+
+DRAWS = 200  # of the posterior, for an interval
+
+
+def rest_shape_sentences(result: CalibrationResult) -> list[str]:
+    """Say how curved a DLO is when nothing bends it, and where; nothing if its rest shape has no knots."""
+    names = [name for name in knot_names(result.space.knots) if name in result.parameters]
+    if not names:
+        return []
+    from dlo_calibration.planning.dlo import Posterior  # the planner comes with it, which few results need
+
+    places = np.linspace(0, 1, 101)
+    size = np.hypot(*natural_curvature(result.physical(), places).T)
+    most = int(size.argmax())
+    drawn = [float(np.hypot(*natural_curvature(one, places[most:most + 1])[0]))
+             for one in Posterior.of(result).draws(DRAWS, seed=0)]
+    low, high = np.percentile(drawn, (5, 95)).tolist()
+    verdicts = Counter(result.parameters[name].verdict for name in names)
+    known = [f'{verdicts[verdict]} {words}' for verdict, words in (
+        (IDENTIFIABLE, 'are known well'), (WEAK, 'only roughly'),
+        (NOT_IDENTIFIABLE, 'could not be determined')) if verdicts[verdict]]
+    return [
+        'When nothing bends it, the DLO is curved: most at '
+        f'{number(100 * places[most])} % of its length, by {_with_radius(size[most])}, with 90 % probability '
+        f'{interval(low, high, "1/m")}; least at {number(100 * places[size.argmin()])} %, by '
+        f'{measured(size.min(), "1/m")}.',
+        f'Of the {len(names)} components of this rest shape, {names[0]} to {names[-1]}, '
+        f'{", ".join(known)}.']
+
+
+def friction_sentences(result: CalibrationResult) -> list[str]:
+    """Say how much of a bend the DLO keeps; nothing if it keeps none, or if that is not known."""
+    if not keeps_bends(result):
+        return []
+    physical, unsure = result.physical(), _verdict(result, 'bending_friction') == WEAK
+    slips = '' if _verdict(result, 'bending_slip') == NOT_IDENTIFIABLE else (
+        f'; they slip where the curvature changes by more than {measured(physical["bending_slip"], "1/m")}')
+    return [f'Bent far and released, the DLO {"may keep" if unsure else "keeps"} a curvature of up to '
+            f'{_with_radius(physical["bending_friction"])}, because its strands rub on each other{slips}.']
+
+
+def keeps_bends(result: CalibrationResult) -> bool:
+    """Return whether it is known that there is friction between the strands."""
+    return result.physical().get('bending_friction', 0.0) > 0 and \
+        _verdict(result, 'bending_friction') != NOT_IDENTIFIABLE
+
+
+def _verdict(result: CalibrationResult, name: str) -> str:
+    """Return the verdict on a calibrated parameter; empty for others."""
+    return result.parameters[name].verdict if name in result.parameters else ''
+
+
+def _with_radius(curvature: float) -> str:
+    return f'{measured(curvature, "1/m")} (a radius of {measured(1 / curvature, "m")})' if curvature > 0 \
+        else measured(curvature, '1/m')
+
+
+FLAT = 1e-3  # m; a hand that rises by less stays on the table
+
+
+def plan_sentences(plan: Plan) -> list[str]:
+    """Return sentences on the actions, whether they reach the goal or why the search ended, and warnings."""
+    steps = []
+    for k, one in enumerate(plan.actions, start=1):
+        hands = '; '.join(_hand(plan.start, hand, 'drags', 2) for hand in one.action.hands)
+        steps.append(f'{k}. {one.name}: {hands}; then the points are {distance(plan, one.predicted)} from '
+                     'the goal on average.')
+    ended = [] if plan.reached else [f'The search ended: {plan.stop_reason}.']
+    return [*steps, outcome(plan), *ended, *map(_sentence, plan.warnings)]
+
+
+def _sentence(words: str) -> str:
+    """Return words that begin with a capital letter and end with a full stop."""
+    return f'{words[:1].upper()}{words[1:].removesuffix(".")}.'
+
+
+def distance(plan: Plan, points: Floats) -> str:
+    """Say how far points, (n, 3) [m], are from the goal on average, in mm and in percent of the length."""
+    return of_length(plan, float(np.linalg.norm(points - plan.goal.points, axis=1).mean()))
+
+
+def of_length(plan: Plan, error: float) -> str:
+    """Return a distance [m] in mm and in percent of the length."""
+    return f'{measured(error, "m")} ({number(100 * error / plan.start.length)} %)'
+
+
+def outcome(plan: Plan) -> str:
+    """Say whether the goal is reached, with how many actions, and how near it gets."""
+    tolerance = f'the tolerance of {of_length(plan, plan.tolerance)}'
+    if not plan.actions and plan.reached:
+        return f'The DLO is at the goal already: {of_length(plan, plan.error_before)}, within {tolerance}.'
+    if not plan.actions:
+        return (f'The goal is not reached, and no action is planned: the DLO stays '
+                f'{of_length(plan, plan.error_before)} away, beyond {tolerance}.')
+    count = f'{len(plan.actions)} action{"" if len(plan.actions) == 1 else "s"}'
+    change = (f'the mean error goes from {of_length(plan, plan.error_before)} to '
+              f'{of_length(plan, plan.error_after)}')
+    score = f'the difference score is {number(plan.score_after)} cm (below {SIMILAR:g}: similar)'
+    if plan.reached:
+        return f'The goal is reached with {count}: {change}, within {tolerance}; {score}.'
+    return f'The goal is not reached: with {count}, {change}, beyond {tolerance}; {score}.'
+
+
+def prediction_sentences(prediction: Prediction) -> list[str]:
+    """Return a sentence for each action, and the warnings."""
+    return [*(f'{k}. {step.name}: {_hands(prediction.start, step)}; then the first point is at '
+              f'{_place(step.chain[0])} m, the last one at {_place(step.chain[-1])} m, and the 90 % '
+              f'intervals are {width(step)} wide on average'
+              f'{"" if step.settled else "; the DLO did not come to rest"}.'
+              for k, step in enumerate(prediction.steps, start=1)), *prediction.warnings]
+
+
+def width(step: PredictedStep) -> str:
+    """Say how wide the 90 % interval of a coordinate is, on average over all points."""
+    return measured(float((step.upper - step.lower).mean()), 'm')
+
+
+def _hands(start: Chain, step: PredictedStep) -> str:
+    """Say what the hands do."""
+    held_by, hands = step.step.held_by, step.step.action.hands
+    after = ['holds it' if hand.name in held_by else 'opens' for hand in hands]
+    return '; '.join(f'{hand.name} {end}' if len(hand.times) == 1 else _hand(start, hand, 'moves', 3, end)
+                     for hand, end in zip(hands, after, strict=True))
+
+
+def _hand(start: Chain, hand: Hand, on_the_table: str, axes: int, after: str = 'opens') -> str:
+    """
+    Say what a hand does.
+
+    :param on_the_table: what it does where it does not lift the DLO.
+    :param axes: number of coordinates to name of the place that it goes to.
+    :param after: what it does there.
+    """
+    places, rise = start.arc_lengths(), float(hand.positions[:, 2].max() - hand.positions[0, 2])
+    way = f'lifts {number(100 * rise)} cm, carries' if rise > FLAT else on_the_table
+    grip = grip_place(places, hand.grips[0], hand.offset) / places[-1]
+    return (f'{hand.name} grips at {grip:.2f} of the length, {way} it to '
+            f'{_place(hand.positions[-1, :axes])} m and {after}')
+
+
+def _place(point: Floats) -> str:
+    """Return a place, (2,) or (3,) [m], in words."""
+    return f'({", ".join(f"{one:.3f}" for one in point.round(3) + 0.0)})'  # no -0.000

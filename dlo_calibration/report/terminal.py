@@ -6,22 +6,27 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Any, Iterable, Mapping, Sequence, TextIO, TYPE_CHECKING
+from typing import Any, Iterable, Mapping, Self, Sequence, TextIO, TYPE_CHECKING
 
 from rich import markup
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column, Table
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.plain import plain
-from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import shortened, told
+from dlo_calibration.calibration.result import CalibrationResult, plain
+from dlo_calibration.errors import safe_line, shortened
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.model.quantity import measured, number
+from dlo_calibration.model.parameters import measured, number
 from dlo_calibration.report import sentences
-from dlo_calibration.report.rows import fit_facts, parameter_rows
+from dlo_calibration.report.sentences import fit_facts, parameter_rows
 
 if TYPE_CHECKING:
     from dlo_calibration.planning.planner import PlanProgress
@@ -31,7 +36,7 @@ LONGEST_TEXT = 2000  # characters of a cell or a sentence: more than any of ours
 
 def escape(text: str) -> str:
     """Return a text for a console, which obeys nothing in it; names of a session can be anything."""
-    return markup.escape(told(text, LONGEST_TEXT))
+    return markup.escape(safe_line(text, LONGEST_TEXT))
 
 
 def console(stream: TextIO) -> Console:
@@ -39,25 +44,23 @@ def console(stream: TextIO) -> Console:
     return Console(file=stream, width=None if stream.isatty() else 110, highlight=False)
 
 
-class SearchBar:
+class _Bar:
     """
     A progress bar on a terminal; elsewhere nothing is shown.
 
-    :param total: largest number of evaluations.
+    :param label: its first column; `columns` come after the count.
     :param shown: False: nothing is shown on a terminal, either.
-    :param known: number of evaluations that a log answers: they tell nothing about the time left.
+    :param fields: of its only task, see `rich.progress.Progress.add_task`.
     """
 
-    def __init__(self, total: int, stream: TextIO, shown: bool = True, known: int = 0) -> None:
-        self._progress = Progress(
-            TextColumn('calibrating'), BarColumn(), MofNCompleteColumn(),
-            TextColumn('best score {task.fields[best]}'), TimeRemainingColumn(),
-            console=console(stream), disable=not (shown and stream.isatty()))
-        self._task = self._progress.add_task('', total=total, best='-')
-        self._best = float('inf')
-        self._known = known
+    def __init__(self, label: str, columns: Sequence[ProgressColumn], stream: TextIO, shown: bool,
+                 **fields: Any) -> None:
+        self.shown = shown and stream.isatty()
+        self._progress = Progress(TextColumn(label), BarColumn(), MofNCompleteColumn(), *columns,
+                                  console=console(stream), disable=not self.shown)
+        self._task = self._progress.add_task('', **fields)
 
-    def __enter__(self) -> SearchBar:
+    def __enter__(self) -> Self:
         """Show it."""
         self._progress.start()
         return self
@@ -65,6 +68,22 @@ class SearchBar:
     def __exit__(self, *_: object) -> None:
         """Stop updating; the bar stays visible."""
         self._progress.stop()
+
+
+class SearchBar(_Bar):
+    """
+    A progress bar of a search.
+
+    :param total: largest number of evaluations.
+    :param shown: False: nothing is shown on a terminal, either.
+    :param known: number of evaluations that come from a log: they do not count for the time left.
+    """
+
+    def __init__(self, total: int, stream: TextIO, shown: bool = True, known: int = 0) -> None:
+        super().__init__('calibrating', [TextColumn('best score {task.fields[best]}'), TimeRemainingColumn()],
+                         stream, shown, total=total, best='-')
+        self._best = float('inf')
+        self._known = known
 
     def take(self, evaluation: Evaluation) -> None:
         """Advance by one evaluation."""
@@ -79,57 +98,32 @@ class SearchBar:
             self._progress.update(self._task, completed=count, best=number(best))
 
 
-class TaskBar:
+class TaskBar(_Bar):
     """
-    A progress bar with the time left, on a terminal; elsewhere nothing is shown.
+    A progress bar with the time left.
 
     :param what: is being counted; the label of the bar.
     :param done: number of the `total` that is done already.
     """
 
     def __init__(self, what: str, total: int, done: int, stream: TextIO) -> None:
-        self.shown = stream.isatty()
-        self._progress = Progress(
-            TextColumn(escape(what)), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            console=console(stream), disable=not self.shown)
-        self._task = self._progress.add_task('', total=total, completed=done)
-
-    def __enter__(self) -> TaskBar:
-        """Show it."""
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop updating; the bar stays visible."""
-        self._progress.stop()
+        super().__init__(escape(what), [TimeRemainingColumn()], stream, True, total=total, completed=done)
 
     def advance(self) -> None:
         """Count one more."""
         self._progress.advance(self._task)
 
 
-class PlanBar:
+class PlanBar(_Bar):
     """
-    A progress bar of a plan on a terminal, with the time left; elsewhere nothing is shown.
+    A progress bar of a plan, with the time left.
 
     :param shown: False: nothing is shown on a terminal, either.
     """
 
     def __init__(self, stream: TextIO, shown: bool = True) -> None:
-        self._progress = Progress(
-            TextColumn('planning action {task.fields[action]}'), BarColumn(), MofNCompleteColumn(),
-            TextColumn('{task.fields[how]}'),
-            console=console(stream), disable=not (shown and stream.isatty()))
-        self._task = self._progress.add_task('', total=None, action=1, how='starting')
-
-    def __enter__(self) -> PlanBar:
-        """Show it."""
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop updating; the bar stays visible."""
-        self._progress.stop()
+        super().__init__('planning action {task.fields[action]}', [TextColumn('{task.fields[how]}')], stream,
+                         shown, total=None, action=1, how='starting')
 
     def take(self, progress: PlanProgress) -> None:
         """Show how far the plan is."""
@@ -138,32 +132,11 @@ class PlanBar:
                               action=progress.actions, how=how)
 
 
-def parameter_table(parameters: Mapping[str, Mapping[str, Any]], space: ParameterSpace) -> Table:
-    """Return a table of parameters in both units, from their plain values in a result."""
-    table = Table(title='parameters')
-    for title in ('parameter', '0..100', '90 % interval', 'physical', '90 % interval', 'verdict'):
-        table.add_column(title, justify='left' if title in ('parameter', 'verdict') else 'right')
-    for row in parameter_rows(parameters, space):
-        table.add_row(*map(escape, (row.name, row.value, row.ends, row.physical, row.physical_ends,
-                                    row.verdict)))
-    return table
-
-
-def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
-    """Return a table of two columns."""
-    table = Table(title=escape(title), show_header=False)
-    for fact in facts:
-        table.add_row(*(escape(text) for text in fact))
-    return table
-
-
-def rows_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with a heading."""
-    table = Table(title=escape(title))
-    for text in head:
-        table.add_column(text)
+def _table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str | Column] = ()) -> Table:
+    """Return a table; without a `head`, only its rows are shown."""
+    table = Table(*head, title=escape(title), show_header=bool(head))
     for row in rows:
-        table.add_row(*(escape(text) for text in row))
+        table.add_row(*map(escape, row))
     return table
 
 
@@ -178,8 +151,12 @@ def print_result(result: CalibrationResult, stream: TextIO,
     out.print(escape(sentences.verdict(result)))
     if values['choice']:
         out.print(escape(values['choice']))
-    out.print(parameter_table(values['parameters'], result.space))
-    out.print(facts_table('fit', fit_facts(values)))
+    numbers = (Column(title, justify='right') for title in (
+        '0..100', '90 % interval', 'physical', '90 % interval'))
+    out.print(_table('parameters', [
+        (row.name, row.value, row.ends, row.physical, row.physical_ends, row.verdict)
+        for row in parameter_rows(values['parameters'], result.space)], ('parameter', *numbers, 'verdict')))
+    out.print(_table('fit', fit_facts(values)))
     for sentence in sentences.sentences(result):
         out.print(escape(sentence))
 
@@ -196,18 +173,18 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
                   ('frame', ', '.join(repr(shortened(frame, 100)) for frame in about['frames']) or '-'),
                   *((topic, f"{count} message{'s' * (count != 1)}")
                     for topic, count in about['messages'].items() if topic not in unknown)]
-    out.print(facts_table(about['session'], [
+    out.print(_table(about['session'], [
         *facts, ('options', shortened(', '.join(recorded)) or 'all have their defaults'),
         ('calibrate', about['choice'].removeprefix('Calibrated: ') or ', '.join(about['calibrate']))]))
     if unknown:
         keys = ('topic', 'type', 'messages')
-        out.print(rows_table('topics that the calibrator does not know', keys, [
-            [str(one[key]) for key in keys] for one in unknown.values()]))
+        out.print(_table('topics that the calibrator does not know', [
+            [str(one[key]) for key in keys] for one in unknown.values()], keys))
     for one in filter(lambda one: one['hint'], unknown.values()):
         out.print(escape(f'hint: {one["hint"]}'), soft_wrap=True)
     if about['trials']:
         head = ('number', 'name', 'points', 'length', 'hands', 'goals', 'duration', 'remarks')
-        out.print(rows_table('trials', head, [
+        out.print(_table('trials', [
             (str(trial['number']), trial['name'], str(trial['points']), measured(trial['length_m'], 'm'),
              ', '.join(f"{shortened(hand['name'], 100)} ({_grips(hand)})" for hand in trial['hands']),
              f"{trial['stable_goals']} stable, {trial['timed_goals']} timed",
@@ -217,7 +194,7 @@ def print_info(about: Mapping[str, Any], stream: TextIO) -> None:
                  ('annotated hands', trial['annotated_hands']),
                  (f"{trial['annotated_features']} annotated features", trial['annotated_features']),
                  (f"unseen points: {trial['unseen_points']}", trial['unseen_points'])) if there) or '-')
-            for trial in about['trials']]))
+            for trial in about['trials']], head))
     for title in ('refusals', 'problems'):
         for text in about[title]:
             out.print(escape(f'{title[:-1]}: {text}'))

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node: the only room that imports rclpy."""
+"""The nodes `calibrator` and `planner`, and the graph of the capture page: only they import rclpy."""

@@ -9,52 +9,182 @@ The session makes all decisions.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict, deque
+from dataclasses import replace
 import functools
 import time
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
+import numpy as np
 from rclpy.clock import ClockChange, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.node import Node
+from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
 from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.messages.codec import INPUT_TYPES
-from dlo_calibration.messages.stamp_order import MARGIN
-from dlo_calibration.ros import graph_node
-from dlo_calibration.ros.graph_node import GraphNode, waiting
-from dlo_calibration.ros.inbox import Inbox
+from dlo_calibration.messages.codec import INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.messages.collector import MARGIN
+from dlo_calibration.model.pose import NUMBERS, Pose
+from dlo_calibration.ros.graph_node import GraphNode, SLICE
 from dlo_calibration.ros.session import CalibrationSession
-from dlo_calibration.ros.table_frame import TableFrame
+
+LIMIT = 64_000_000  # bytes that wait: 100,000 chains of 40 points, and few beside the 1 GB of a small robot
+OVERHEAD = 200  # bytes of a waiting message, besides its content
+PUBLISHERS = 64  # on a topic; those that were silent for longest are forgotten
+
+
+class Inbox:
+    """
+    Messages that came and wait to be collected, and requests between them.
+
+    A message was dropped if its publisher's next one has a number beyond the next: the queue
+    below rclpy keeps only the newest ones.  Those before its first one are not counted: nobody may have
+    listened yet.  rclpy hides the publisher; continuing the nearest lower number still gives the right total.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[str, bytes | None]] = deque()
+        self._size = 0
+        self._last: dict[str, list[int]] = defaultdict(list)
+        self._dropped: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        """Return how many messages and requests wait."""
+        return len(self._waiting)
+
+    def put(self, kind: str, octets: bytes, number: int | None) -> None:
+        """Take a message with the `number` that its publisher gave it; None: it gives none."""
+        if number is not None:
+            self.drop(kind, self._gap(self._last[kind], number))
+        size = len(octets) + OVERHEAD
+        if self._size + size > LIMIT and self._waiting:
+            self.drop(kind, 1)
+            return
+        self._waiting.append((kind, octets))
+        self._size += size
+
+    def put_request(self, name: str) -> None:
+        """Take a request that refers to all messages before it."""
+        self._waiting.append((name, None))
+
+    def take(self) -> tuple[str, bytes | None]:
+        """Return the oldest message, as kind and bytes, or request, as name and None."""
+        kind, octets = self._waiting.popleft()
+        if octets is not None:
+            self._size -= len(octets) + OVERHEAD
+        return kind, octets
+
+    @property
+    def first(self) -> tuple[str, bytes | None]:
+        """What `take` would return; ('', None) if nothing waits."""
+        return self._waiting[0] if self._waiting else ('', None)
+
+    def drop(self, kind: str, count: int) -> None:
+        """Count messages that were dropped."""
+        if count:
+            self._dropped[kind] += count
+
+    def take_dropped(self) -> Counter[str]:
+        """Return how many messages of each kind were dropped since the last call."""
+        dropped, self._dropped = self._dropped, Counter()
+        return dropped
+
+    def numbered(self, kind: str) -> bool:
+        """Return whether publishers number the messages of a kind."""
+        return bool(self._last[kind])
+
+    def forget_publishers(self, kind: str) -> None:
+        """Forget the numbers of a kind, as all of its publishers have gone."""
+        self._last[kind].clear()
+
+    @staticmethod
+    def _gap(last: list[int], number: int) -> int:
+        """Return how many messages are missing before one with this number."""
+        before = max((one for one in last if one < number), default=None)
+        if before is None:
+            before = number - 1  # a publisher that is new
+            del last[:len(last) + 1 - PUBLISHERS]
+        else:
+            last.remove(before)
+        last.append(number)
+        return number - before - 1
+
+
+class TableFrame:
+    """
+    The pose for an option `frame_pose` that is the name of the table's frame.
+
+    It is looked up once, for the frame of the first message: the camera does not move.
+
+    :param node: listens to ``/tf`` and ``/tf_static`` from the first name on.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._name: str | None = None
+        self.pose: Pose | None = None
+
+    @property
+    def missing(self) -> bool:
+        """Whether the pose is needed and not known yet."""
+        return self._name is not None and self.pose is None
+
+    def choose(self, options: Options) -> None:
+        """
+        Use the options from now on.
+
+        :raises InputError: if they name a frame, and tf2_ros is not installed.
+        """
+        if options.table_frame is not None and self._buffer is None:
+            try:
+                from tf2_ros import Buffer, TransformListener
+            except ImportError:
+                raise InputError('parameter frame_pose', f'the name {options.table_frame!r}',
+                                 f'the numbers {NUMBERS}, as tf2_ros is not installed',
+                                 'give the pose, or install tf2_ros (ros-jazzy-tf2-ros-py)') from None
+            self._buffer = Buffer()
+            self._listener = TransformListener(self._buffer, self._node)
+        self._name, self.pose = options.table_frame, None
+
+    def applied(self, options: Options) -> Options:
+        """Return the options with the pose in place of the name; empty as long as it is missing."""
+        if options.table_frame is None:
+            return options
+        return replace(options, frame_pose='' if self.pose is None else str(self.pose))
+
+    def look_up(self, frame: str) -> str:
+        """Look up where the `frame` of the chains is in the table's; return a sentence about it."""
+        from tf2_ros import TransformException
+
+        try:
+            transform = self._buffer.lookup_transform(self._name, frame, Time()).transform
+        except TransformException as error:
+            return (f'parameter frame_pose: no transform from {frame!r} to {self._name!r}; expected one '
+                    f'on /tf or /tf_static; messages wait for it: publish it, or set the pose ({error})')
+        place, turn = transform.translation, transform.rotation
+        self.pose = Pose(np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
+        return f'{frame!r} is at {self.pose} in {self._name!r}, from tf2: that is frame_pose'
+
 
 ANSWER = 0.1  # s for waiting messages before a request is answered, of 0.2 s for the whole
-SLICE = 0.02  # s of collecting between two looks at the queues, which overflow in 0.1 s in a flood
-
-
-def spin(args: Sequence[str], should_stop: Callable[[], bool],
-         make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
-    """
-    Run the node until `should_stop` returns true; the caller handles the signals.
-
-    :param args: command line without the program's name.
-    :returns: exit code: 0; 2, with one line on stderr, if an argument or a parameter cannot be used.
-    """
-    return graph_node.spin('calibrator', lambda: CalibratorNode(make_simulator), args, should_stop)
 
 
 class CalibratorNode(GraphNode[Options]):
     """
-    The node `calibrator`; it is the `Graph` of its session.
+    The node `calibrator`; it is the `NodeInterface` of its session.
 
     :param make_simulator: builds the engine, in the worker's thread.
     :param arguments: of `rclpy.node.Node`, e.g. `parameter_overrides`.
     :raises InputError: for a parameter with an unknown name or a bad value.
     """
+
+    queue = 1000  # holds a burst of goal chains while another callback works, and at most 320 MB
 
     def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
         super().__init__('calibrator', Options, INPUT_TYPES, **arguments)
@@ -67,12 +197,13 @@ class CalibratorNode(GraphNode[Options]):
         for name, kind in OUTPUT_TYPES.items():
             # Progress is not latched: a late subscriber has no use for an old one.
             self.offer(name, kind, latched=name != 'progress')
-        self.session = CalibrationSession(self, self.types, make_simulator)
+        self.session: CalibrationSession = CalibrationSession(self, self.types, make_simulator)
         self._inbox = Inbox()
         self._working, self._waited = False, ''
         self._more = self.create_guard_condition(self._work)
+        self.reactions.update(message_lost=self._on_message_lost, matched=self._on_matched)
         self.subscribe(*INPUT_TYPES)
-        for name in ('start', 'stop', 'reset', 'discard_last'):
+        for name in self.session.requests:
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         self._jump: TimeJump | None = None  # of the node's clock, back
         # rclpy calls nobody, or crashes, where this is not kept.
@@ -85,8 +216,8 @@ class CalibratorNode(GraphNode[Options]):
     def end(self) -> None:
         """End the session, with all messages that have come."""
         self._jumps.unregister()
-        for kind, subscription in self.inputs.items():
-            self.drain(kind, subscription)
+        for kind in self.inputs:
+            self.drain(kind)
         while len(self._inbox):
             kind, octets = self._inbox.take()
             if octets is not None:
@@ -99,7 +230,7 @@ class CalibratorNode(GraphNode[Options]):
         return self._frame.applied(super().options())
 
     def changed(self, names: Sequence[str], options: Options) -> None:
-        """Log that new values have to wait, if a calibration is under way; take note of a named frame."""
+        """Apply new values before the next message; log that a calibration under way keeps the old ones."""
         if 'frame_pose' in names:
             self._frame.choose(options)
         self._changed = True
@@ -107,35 +238,21 @@ class CalibratorNode(GraphNode[Options]):
         if self.session.calibrating:
             self.info(f'{", ".join(names)}: takes effect at the next start')
 
-    def refuse(self, text: str) -> None:
-        """Tell why something was refused, in the log and in ``~/status``."""
-        self.session.refuse(text)
-
-    def fail(self, text: str) -> None:
-        """Report a failure in ``~/status`` and in the log."""
-        self.session.fail(text)
-
     # Subscriptions
 
-    def subscription(self, kind: str, reliability: ReliabilityPolicy) -> Any:
-        """Subscribe to an input topic."""
-        # The queue holds a burst of goal chains while another callback works, and at most 320 MB.
-        return self.create_subscription(
-            self.classes[kind], f'~/{kind}', functools.partial(self._hear, kind),
-            QoSProfile(depth=1000, reliability=reliability), raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self.on_incompatible_qos, kind),
-                message_lost=functools.partial(self._on_message_lost, kind),
-                matched=functools.partial(self._on_matched, kind)))
-
-    def _hear(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
-        self._after_jump()
+    def take(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
+        """Put a message into the inbox."""
         self._inbox.put(kind, octets, info['publication_sequence_number'])
-        self.drain(kind, self.inputs[kind])
+
+    def hear(self, kind: str, octets: bytes, info: Mapping[str, Any]) -> None:
+        """Take a message and those that wait behind it, and collect them."""
+        self._after_jump()
+        self.take(kind, octets, info)
+        self.drain(kind)
         self._work()
 
     def _work(self, seconds: float = SLICE) -> None:
-        """Collect waiting messages for some time, and see to it that the others are collected soon."""
+        """Collect waiting messages for some seconds; if more are left, call this again soon."""
         if not self._in_frame():
             return
         if self._changed:  # what comes next is judged with the new values
@@ -164,11 +281,11 @@ class CalibratorNode(GraphNode[Options]):
 
     @property
     def _waiting(self) -> int:
-        """How many messages wait to be collected, for the first time or anew."""
+        """Number of messages to collect, for the first time or anew."""
         return len(self._inbox) + self.session.collecting.left
 
     def _in_frame(self) -> bool:
-        """Tell whether messages can be used: they wait while the pose of their frame is missing."""
+        """Return whether messages can be collected: they wait while the pose of their frame is unknown."""
         if not self._frame.missing:
             return True
         frame = self.session.collecting.collector.frame_id
@@ -178,7 +295,7 @@ class CalibratorNode(GraphNode[Options]):
                 return True
             try:
                 frame = self.decode(kind, octets).header.frame_id
-            except Exception:  # the session tells why
+            except Exception:  # the session reports why
                 return True
         words = self._frame.look_up(frame)
         if self._frame.missing:
@@ -191,19 +308,14 @@ class CalibratorNode(GraphNode[Options]):
         return True
 
     def _on_message_lost(self, kind: str, event: Any) -> None:
-        if not self._inbox.numbered(kind):  # else the numbers tell it, and more
+        if not self._inbox.numbered(kind):  # else the numbers give it, and more
             self._inbox.drop(kind, event.total_count_change)
 
     def _on_matched(self, kind: str, event: Any) -> None:
         if event.current_count == 0:
-            self.drain(kind, self.inputs[kind])
+            self.drain(kind)
             self._inbox.forget_publishers(kind)
             self._more.trigger()
-
-    def drain(self, kind: str, subscription: Any) -> None:
-        """Put the messages in a subscription's queue into the inbox."""
-        for octets, info in waiting(subscription, SLICE):
-            self._inbox.put(kind, octets, info['publication_sequence_number'])
 
     # Services and the clock
 
@@ -231,15 +343,15 @@ class CalibratorNode(GraphNode[Options]):
             self._jump = jump
 
     def _after_jump(self) -> None:
-        """Begin another session if the node's clock went back; not in the callback, inside the clock."""
+        """Begin another session if the clock went back; not in the callback, which runs inside the clock."""
         if self._jump is not None:
             jump, self._jump, now = self._jump, None, self.stamp()
             self.session.clock_went_back(now - jump.delta.nanoseconds, now)
 
     def hear_waiting(self) -> None:
-        """Pass on the messages that wait, as far as that takes less than the time for an answer."""
+        """Collect the messages that wait, for at most the time that an answer may take."""
         if self._working:
             return
-        for kind, subscription in self.inputs.items():
-            self.drain(kind, subscription)
+        for kind in self.inputs:
+            self.drain(kind)
         self._work(ANSWER)

@@ -12,20 +12,20 @@ import threading
 import time
 from typing import Any, Callable, Sequence
 
-from dlo_calibration.capture.connections import TopicImage
-from dlo_calibration.capture.raw_image import decoded
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.messages.codec import (
     action_trajectory,
     ActionMessage,
     chain_cloud,
     INPUT_TYPES,
     NANOSECONDS,
+    OUTPUT_TYPES,
     rclpy_types,
 )
 from dlo_calibration.messages.encoder import trial_messages
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.page.graph import TopicImage
+from dlo_calibration.vision.photograph import decoded
 
 IMAGE, COMPRESSED, INFO = (f'sensor_msgs/msg/{name}' for name in ('Image', 'CompressedImage', 'CameraInfo'))
 DISCOVERY = 1.0  # s from joining the graph until its topics are known
@@ -52,7 +52,7 @@ class CaptureGraph:
 
     def image(self, topic: str) -> TopicImage:
         """
-        Return the newest image of a topic, and the lens that the camera's CameraInfo tells.
+        Return the newest image of a topic, and the lens from the camera's CameraInfo.
 
         :raises InputError: if none comes.
         """
@@ -62,7 +62,9 @@ class CaptureGraph:
             if kinds.get(topic) not in (IMAGE, COMPRESSED):
                 raise InputError(f'topic {topic}', kinds.get(topic, 'no such topic'), 'a topic with images',
                                  'choose one of the list')
-            beside = _camera_info(topic)
+            # Compressed images are one level below the raw ones (image_transport).
+            camera, _, image = topic.removesuffix('/compressed').rpartition('/')
+            beside = f'{camera}/camera_info'
             wanted = [topic, beside] if kinds.get(beside) == INFO else [topic]
             heard = self._heard({name: kinds[name] for name in wanted})
         if topic not in heard:
@@ -70,7 +72,7 @@ class CaptureGraph:
                              'check that it does, and with which quality of service')
         message = heard[topic]
         picture = bytes(message.data) if kinds[topic] == COMPRESSED else decoded(f'image on {topic}', message)
-        return TopicImage(picture, _lens(heard.get(beside), 'rect' in _raw(topic).rpartition('/')[2]))
+        return TopicImage(picture, _lens(heard.get(beside), 'rect' in image))
 
     def send(self, trials: Sequence[Trial], namespace: str) -> str:
         """
@@ -124,7 +126,7 @@ class CaptureGraph:
         return {name: kinds[0] for name, kinds in self._node.get_topic_names_and_types() if len(kinds) == 1}
 
     def _spin(self, ready: Callable[[], bool], patience: float) -> bool:
-        """Take part until something is so, for some time [s]; tell whether it is."""
+        """Take part until `ready`, for at most `patience` [s]; return whether it is."""
         until = time.monotonic() + patience
         while not ready() and time.monotonic() < until:
             self._executor.spin_once(timeout_sec=0.02)
@@ -191,23 +193,9 @@ def _value(message: Any, key: str) -> str:
     return str(next((pair.value for pair in message.status[0].values if pair.key == key), ''))
 
 
-def _parent(topic: str) -> str:
-    """Return the namespace of a camera."""
-    return _raw(topic).rpartition('/')[0]
-
-
-def _raw(topic: str) -> str:
-    """Return the topic of the raw images; compressed ones are one level below it (image_transport)."""
-    return topic.removesuffix('/compressed')
-
-
-def _camera_info(topic: str) -> str:
-    return f'{_parent(topic)}/camera_info'
-
-
 def _lens(info: Any, rectified: bool) -> bytes | None:
     """
-    Return a ROS camera calibration file with what a CameraInfo tells; None if the camera is not calibrated.
+    Return a ROS camera calibration file from a CameraInfo; None if the camera is not calibrated.
 
     :param rectified: the image has no distortion any more; then the projection matrix holds (image_proc).
     """

@@ -1,39 +1,55 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Executable: runs a node as a program; it installs its signal handlers before it loads ROS."""
+"""The executables `calibrator` and `planner`: each installs its signal handlers before it loads ROS."""
 
 from __future__ import annotations
 
+from importlib import import_module
 import sys
-from typing import Callable, Sequence
+from typing import Sequence
 
 from dlo_calibration.signals import StopFlag
 from dlo_calibration.writing import remove_unfinished
 
-Spin = Callable[[Sequence[str], Callable[[], bool]], int]
+#: Program -> module and class of its node, and what ``--help`` says of it.
+PROGRAMS = {
+    'calibrator': ('dlo_calibration.ros.calibrator_node', 'CalibratorNode',
+                   'Calibrates a deformable linear object from messages.'),
+    'planner': ('dlo_calibration.ros.planner_node', 'PlannerNode',
+                'Plans actions that bring a calibrated deformable linear object to a goal.'),
+}
 
 
-def execute(program: str, purpose: str, load: Callable[[], Spin], args: Sequence[str] | None) -> int:
+def calibrator() -> int:
+    """Run the calibrator with the command line of the process, as `execute` does."""
+    return execute('calibrator', sys.argv[1:])
+
+
+def planner() -> int:
+    """Run the planner with the command line of the process, as `execute` does."""
+    return execute('planner', sys.argv[1:])
+
+
+def execute(program: str, args: Sequence[str]) -> int:
     """
-    Run a node until a signal arrives.
+    Run a node until a signal arrives; SIGINT and SIGTERM end it cleanly even while it is starting.
 
-    So SIGINT and SIGTERM end it cleanly even while it is starting.
-
-    :param purpose: sentences for ``--help``.
-    :param load: imports the node, and returns the function that runs it until its second argument is true.
-    :param args: command line without the program's name; None: that of the process.
+    :param program: one of PROGRAMS.
+    :param args: command line without the program's name.
     :returns: exit code: 0; 2, with one line on stderr, if an argument, a parameter or ROS cannot be used.
     """
-    args = list(sys.argv[1:] if args is None else args)
-    if args in (['-h'], ['--help']):
+    module, node, purpose = PROGRAMS[program]
+    if list(args) in (['-h'], ['--help']):
         sys.stdout.write(f'usage: {program} [--ros-args -p NAME:=VALUE ... --params-file FILE ...]\n\n'
                          f'{purpose}  Ends on SIGINT or SIGTERM.\n')
         return 0
     stop = StopFlag()
     stop.listen()
     try:
-        return load()(args, stop)
+        from dlo_calibration.ros.graph_node import spin
+
+        return spin(program, getattr(import_module(module), node), args, stop)
     except ImportError as error:
         if stop():  # an import that a signal disturbs may fail in any way
             return 0
@@ -43,3 +59,7 @@ def execute(program: str, purpose: str, load: Callable[[], Spin], args: Sequence
     finally:
         stop.ignore()
         remove_unfinished()
+
+
+if __name__ == '__main__':
+    sys.exit(execute(sys.argv[1], sys.argv[2:]))

@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 from typing import Any, Iterable, Mapping, Sequence
 
-from dlo_calibration.errors import InputError, meant
+from dlo_calibration.errors import InputError, suggestion
 
 
 def node_and_rviz(file: str, node: str, *, parameters: Mapping[str, str], topics: Mapping[str, str],
@@ -81,7 +81,7 @@ def check_arguments(file: str, known: Sequence[str], words: Sequence[str] | None
         name, given, _ = word.partition(':=')
         if given and name not in known:
             raise InputError(f'{Path(file).name}', f'the argument {name}', f'one of {", ".join(known)}',
-                             meant(name, known, 'for another parameter, change a copy of the parameter '
+                             suggestion(name, known, 'for another parameter, change a copy of the parameter '
                                    'file, and give it as params_file'))
 
 

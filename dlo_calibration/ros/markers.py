@@ -10,14 +10,14 @@ from typing import Any, Iterator, Sequence
 import numpy as np
 
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.messages.codec import MessageTypes
+from dlo_calibration.messages.codec import MessageTypes, OUTPUT_TYPES
 from dlo_calibration.model.action import Hand, NO_ROTATION
 from dlo_calibration.model.chain import Chain, Floats
+from dlo_calibration.model.parameters import measured
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.score import PointErrors, residuals
 from dlo_calibration.model.trial import shown_goals, Trial
+from dlo_calibration.planning.plan import Plan, PlannedAction
 from dlo_calibration.report.drawing import hand_path
 
 # Types and actions of visualization_msgs/Marker.
@@ -25,7 +25,7 @@ CUBE, SPHERE, LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 1, 2, 4, 5, 7, 9
 ADD, DELETE_ALL = 0, 3
 
 MOST_HANDS = 100  # drawn of a trial; a flood gives thousands, and drawing them would delay answers
-MOST_POINTS = 200  # drawn of a chain or path; closer points cannot be told apart on a screen
+MOST_POINTS = 200  # drawn of a chain or path; closer points cannot be distinguished on a screen
 
 # Red, green and blue from 0 to 1: they differ in hue, and are bright enough for a dark background.
 Colour = tuple[float, float, float]
@@ -73,14 +73,14 @@ def error_colour(share: float) -> Colour:
 
 
 def alike(trials: Sequence[Trial], others: Sequence[Trial]) -> bool:
-    """Tell whether trials look the same: only the mean of a stream that goes on may differ."""
+    """Return whether trials look the same: only the mean of a stream that goes on may differ."""
     return len(trials) == len(others) and all(
         len(one.actions) == len(two.actions) and np.array_equal(one.initial.points, two.initial.points)
         and _same(one, two) for one, two in zip(trials, others, strict=True))
 
 
 def _same(trial: Trial, other: Trial) -> bool:
-    """Tell whether two trials have the same goals; a tracker that goes on changes the mean of a stream."""
+    """Return whether two trials have the same goals; a tracker that goes on changes the mean of a stream."""
     return trial is other or len(trial.goals) == len(other.goals) and all(
         min(one.count, two.count) > 1 and one.time == two.time or one.chain is two.chain
         or np.array_equal(one.chain.points, two.chain.points)
@@ -210,3 +210,58 @@ def _kept(count: int, group: int) -> list[int]:
         return list(range(group * groups))
     chosen = np.linspace(0, groups - 1, MOST_POINTS).round()
     return [group * int(k) + i for k in chosen for i in range(group)]
+
+
+def plan_markers(types: MessageTypes, plan: Plan, *, stamp: int, frame_id: str,
+                 pose: Pose | None = None) -> Any:
+    """
+    Build the message that shows a plan; it replaces everything that earlier messages show.
+
+    Namespaces are ``plan/start``, ``/goal``, ``/label``, and for each action ``action_1/predicted``,
+    ``/interval``, ``/hands``, ``/label``.  The colour of a prediction goes from that of the start to
+    orange.  An interval is a cross at each point: the 90 % intervals of its coordinates.
+
+    :param pose: of the plan's frame in that of `frame_id`; None: they are the same.
+    """
+    header = types.header(stamp, frame_id)
+    thickness = 0.01 * plan.start.length
+    brush = Brush(types, header, 'plan', thickness, pose)
+    title = (f'{len(plan.actions)} action(s): mean error {measured(plan.error_before, "m")} before, '
+             f'{measured(plan.error_after, "m")} after')
+    built = [cleared(types, header), brush.line('start', 0, plan.start.points, INITIAL_COLOUR),
+             brush.spheres('goal', 0, plan.goal.points, [GOAL_COLOUR], 1.2),
+             brush.line('goal', 1, plan.goal.points, GOAL_COLOUR, 0.5),
+             brush.label('label', 0, plan.goal.points[0] + [0.0, 0.0, 6 * thickness], title)]
+    before = plan.start.points
+    for k, action in enumerate(plan.actions):
+        red, green, blue = np.add(np.multiply((k + 1) / len(plan.actions), SIMULATED_COLOUR),
+                                  np.multiply(1 - (k + 1) / len(plan.actions), INITIAL_COLOUR)).tolist()
+        brush = Brush(types, header, f'action_{k + 1}', thickness, pose)
+        built += _action_markers(brush, action, before, k, (red, green, blue))
+        before = action.predicted
+    return types.build(OUTPUT_TYPES['markers'], markers=built)
+
+
+def _action_markers(brush: Brush, action: PlannedAction, before: Floats, k: int,
+                    colour: Colour) -> Iterator[Any]:
+    """
+    Show the k-th action.
+
+    :param before: (n, 3) [m] the DLO when the hands close.
+    """
+    yield brush.line('predicted', 0, action.predicted, colour)
+    yield brush.marker('interval', 0, LINE_LIST, points=_crosses(action), colours=[colour], scale=0.3,
+                       group=6)
+    for place, hand in enumerate(action.action.hands):
+        yield from hand_markers(brush, 3 * place, hand, Chain(before))
+    place = action.action.hands[0].positions[0]
+    yield brush.label('label', 0, place + [0.0, 0.0, 6 * brush.thickness], f'{k + 1}. {action.name}')
+
+
+def _crosses(action: PlannedAction) -> Floats:
+    """Return the (6 n, 3) ends [m] of the three intervals of each point, axis by axis."""
+    ends = np.repeat(action.predicted[:, None, None, :], 3, axis=1).repeat(2, axis=2)  # point, axis, end
+    axes = np.arange(3)
+    ends[:, axes, 0, axes], ends[:, axes, 1, axes] = action.lower, action.upper
+    crosses: Floats = ends.reshape(-1, 3)
+    return crosses

@@ -17,11 +17,10 @@ import sys
 import textwrap
 from typing import Mapping
 
-from dlo_calibration.calibration.declaration import Declaration, DeclaredOptions
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.ros.planner_options import PlannerOptions
+from dlo_calibration.calibration.options import Declaration, DeclaredOptions, Options
+from dlo_calibration.ros.planner_session import PlannerOptions
 
-NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot tell one from other empty lists
+NO_TEXTS = ['']  # an empty list of texts as a parameter: ROS cannot distinguish it from other empty lists
 
 #: name of a node -> its options
 NODES: Mapping[str, type[DeclaredOptions]] = {'calibrator': Options, 'planner': PlannerOptions}

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from dlo_calibration.calibration.engines import make_simulator as make_chosen_simulator
@@ -22,9 +20,7 @@ from dlo_calibration.calibration.engines import SimulatorFactory
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import Description, read_description, WHAT
 from dlo_calibration.files.xml import read_octets
-from dlo_calibration.ros import graph_node
-from dlo_calibration.ros.graph_node import GraphNode, waiting
-from dlo_calibration.ros.planner_options import PlannerOptions, PUBLISH
+from dlo_calibration.ros.graph_node import GraphNode
 from dlo_calibration.ros.planner_session import (
     ACTION,
     CHAIN,
@@ -32,66 +28,48 @@ from dlo_calibration.ros.planner_session import (
     GOAL,
     INPUT_TYPES,
     OUTPUT_TYPES,
+    PlannerOptions,
     PlannerSession,
+    PUBLISH,
 )
-
-SLICE = 0.02  # s for the messages that wait in a queue
-QUEUE = 10  # messages that wait on a topic; only the newest are of use
-
-
-def spin(args: Sequence[str], should_stop: Callable[[], bool],
-         make_simulator: SimulatorFactory = make_chosen_simulator) -> int:
-    """
-    Run the node until `should_stop` returns true; the caller handles the signals.
-
-    :param args: command line without the program's name.
-    :returns: exit code: 0; 2, with one line on stderr, if an argument or a parameter cannot be used.
-    """
-    return graph_node.spin('planner', lambda: PlannerNode(make_simulator), args, should_stop)
 
 
 class PlannerNode(GraphNode[PlannerOptions]):
     """
-    The node `planner`; it is the `Graph` of its session.
+    The node `planner`; it is the `NodeInterface` of its session.
 
     :param make_simulator: builds the engine, in the planning thread.
-    :param session: further arguments of `PlannerSession`.
     :param arguments: of `rclpy.node.Node`, e.g. `parameter_overrides`.
     :raises InputError: for a parameter with an unknown name or a bad value, or a description that cannot be
         used.
     """
 
-    def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, *,
-                 session: Mapping[str, Any] | None = None, **arguments: Any) -> None:
+    latched = (DESCRIPTION,)
+
+    def __init__(self, make_simulator: SimulatorFactory = make_chosen_simulator, **arguments: Any) -> None:
         super().__init__('planner', PlannerOptions, INPUT_TYPES, **arguments)
         self.session: PlannerSession | None = None  # in the mode publish there is none
-        self._file: _File | None = None  # of the description in use; None: it comes as a message
-        self._next: _File | None = None  # replaces it at the next tick
+        self._next: tuple[Path, bytes, Description] | None = None  # replaces the description at the next tick
         try:
             options = self.options()
-            self._next = _File.read(options.description) if options.description else None
+            self._next = _read(options.description) if options.description else None
             if options.mode != PUBLISH:
-                self._begin(make_simulator, session or {})
+                self._begin(make_simulator)
             self._serve_description()
             self.serve_parameters()
         except BaseException:
             self.close()
             raise
 
-    def _begin(self, make_simulator: SimulatorFactory, session: Mapping[str, Any]) -> None:
+    def _begin(self, make_simulator: SimulatorFactory) -> None:
         for name, kind in OUTPUT_TYPES.items():
             # Nobody has a use for old progress, and a robot that comes late must not execute an old action.
             self.offer(name, kind, latched=name not in ('progress', ACTION))
-        self.session = PlannerSession(self, self.types, make_simulator, **session)
+        self.session = PlannerSession(self, self.types, make_simulator)
         self.subscribe(CHAIN, GOAL, *([] if self._next else [DESCRIPTION]))
-        for name in ('plan', 'stop'):
+        for name in self.session.requests:
             self.create_service(Trigger, f'~/{name}', functools.partial(self._serve, name))
         self.info('call ~/plan to plan from the newest ~/chain to the newest ~/goal_chain')
-
-    def end(self) -> None:
-        """End the session."""
-        if self.session is not None:
-            self.session.close()
 
     def act(self) -> None:
         """Do what is due now."""
@@ -101,7 +79,7 @@ class PlannerNode(GraphNode[PlannerOptions]):
 
     def changed(self, names: Sequence[str], options: PlannerOptions) -> None:
         """
-        Take note of another description.
+        Use another description from the next tick on.
 
         :raises InputError: if it cannot be used, or the mode changes.
         """
@@ -113,66 +91,39 @@ class PlannerNode(GraphNode[PlannerOptions]):
             if not options.description:
                 raise InputError('parameter description', 'a change to an empty text', 'another path',
                                  'start the node again without a description to listen for one')
-            self._next = _File.read(options.description)
+            self._next = _read(options.description)
         if self.session is not None and self.session.planning:
             self.info(f'{", ".join(names)}: takes effect at the next plan')
-
-    def refuse(self, text: str) -> None:
-        """Tell why something was refused, in the log and in ``~/status``."""
-        if self.session is None:
-            self.warn(text)
-        else:
-            self.session.refuse(text)
-
-    def fail(self, text: str) -> None:
-        """Report a failure in ``~/status`` and in the log."""
-        if self.session is None:
-            self.error(text)
-        else:
-            self.session.fail(text)
 
     # The description
 
     def _serve_description(self) -> None:
-        """Publish the description that a file newly gave, instead of listening for one."""
+        """Publish a description newly read from a file, and stop listening for one."""
         if self._next is None:
             return
-        if self._file is None:
+        (path, octets, description), self._next = self._next, None
+        if DESCRIPTION not in self.outputs:
             if DESCRIPTION in self.inputs:
                 self.destroy_subscription(self.inputs.pop(DESCRIPTION))
             self.offer(DESCRIPTION, INPUT_TYPES[DESCRIPTION])
-        self._file, self._next = self._next, None
-        message = self.types.build(INPUT_TYPES[DESCRIPTION], data=self._file.octets.decode('utf-8'))
+        message = self.types.build(INPUT_TYPES[DESCRIPTION], data=octets.decode('utf-8'))
         self.publish(DESCRIPTION, self.encode(DESCRIPTION, message))
         if self.session is not None:
-            self.session.describe(self._file.found, str(self._file.path))
+            self.session.describe(description, str(path))
         else:
-            self.info(f'{self._file.path} is published on {self.topic(DESCRIPTION)}')
+            self.info(f'{path} is published on {self.topic(DESCRIPTION)}')
 
     # Subscriptions and services
 
-    def subscription(self, kind: str, reliability: ReliabilityPolicy) -> Any:
-        """Subscribe to an input topic."""
-        latched = DurabilityPolicy.TRANSIENT_LOCAL if kind == DESCRIPTION else DurabilityPolicy.VOLATILE
-        return self.create_subscription(
-            self.classes[kind], f'~/{kind}', functools.partial(self._hear, kind),
-            QoSProfile(depth=QUEUE, reliability=reliability, durability=latched), raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self.on_incompatible_qos, kind)))
-
-    def _hear(self, kind: str, octets: bytes) -> None:
+    def take(self, kind: str, octets: bytes, _: Mapping[str, Any]) -> None:
+        """Give a message to the session."""
         if self.session is not None:
             self.session.hear(kind, octets)
 
-    def drain(self, kind: str, subscription: Any) -> None:
-        """Give the messages in a subscription's queue to the session."""
-        for octets, _ in waiting(subscription, SLICE):
-            self._hear(kind, octets)
-
     def hear_waiting(self) -> None:
         """Give the messages that wait to the session."""
-        for kind, subscription in self.inputs.items():
-            self.drain(kind, subscription)
+        for kind in self.inputs:
+            self.drain(kind)
 
     def _serve(self, name: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         assert self.session is not None
@@ -180,23 +131,12 @@ class PlannerNode(GraphNode[PlannerOptions]):
         return response
 
 
-class _File:
+def _read(name: str) -> tuple[Path, bytes, Description]:
     """
-    A description in a file.
+    Return a description in a file, with its path, and its document as the file has it.
 
-    :param octets: its document, as the file has it.
+    :raises InputError: where it cannot be read, or is not a valid result.
     """
-
-    def __init__(self, path: Path, octets: bytes, found: Description) -> None:
-        self.path, self.octets, self.found = path, octets, found
-
-    @classmethod
-    def read(cls, name: str) -> _File:
-        """
-        Read a file.
-
-        :raises InputError: where it cannot be read, or is not a valid result.
-        """
-        path = Path(name).expanduser()
-        octets = read_octets(path, WHAT, 'a result.xml')
-        return cls(path, octets, read_description(octets, f'{WHAT} {path}', path.parent))
+    path = Path(name).expanduser()
+    octets = read_octets(path, WHAT, 'a result.xml')
+    return path, octets, read_description(octets, f'{WHAT} {path}', path.parent)

@@ -2,45 +2,147 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-PlannerSession: what the node `planner` knows, and what it does with a message, a request or time that passes.
+PlannerSession: the state of the node `planner`, and its reactions to messages, requests and time.
 
-It imports no rclpy: it reaches ROS through a `Graph`, which the node implements.
+It imports no rclpy: it reaches ROS through a `NodeInterface`, which the node implements.
 Every error is reported in the log and in ``~/status``, and the node goes on working.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 import json
 import time
-from typing import Any, Callable, Mapping, Protocol, Union
+from typing import Any, Callable, Mapping, Union
 
-from dlo_calibration.calibration.background import Background, Failure
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.options import Options
-from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
+from dlo_calibration.calibration.options import Declaration, declared, MACHINE, Options, SIMULATION
+from dlo_calibration.errors import DEFECT, InputError
 from dlo_calibration.files.result import Description, read_description
 from dlo_calibration.messages.codec import action_trajectory, ChainMessage, MessageTypes, NANOSECONDS, read
 from dlo_calibration.messages.encoder import action_message
-from dlo_calibration.messages.refusals import Refusals
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.planning.checks import checked
-from dlo_calibration.planning.plain import plain_plan
-from dlo_calibration.planning.plan import Plan
-from dlo_calibration.planning.planner import plan as find_plan
-from dlo_calibration.planning.planner import PlanProgress
-from dlo_calibration.report.plan_sentences import outcome
-from dlo_calibration.ros.graph import decoded, Graph, why
-from dlo_calibration.ros.newest import Newest
-from dlo_calibration.ros.planner_diagnostics import (
-    DONE,
-    FAILED,
-    plan_progress,
-    planner_status,
-    PLANNING,
-    WAITING,
-)
-from dlo_calibration.ros.planner_markers import plan_markers
-from dlo_calibration.ros.planner_options import PlannerOptions
+from dlo_calibration.planning.options import PlanOptions
+from dlo_calibration.planning.plan import plain_plan, Plan
+from dlo_calibration.planning.planner import checked, plan, PlanProgress
+from dlo_calibration.report.sentences import outcome
+from dlo_calibration.ros.diagnostics import DONE, plan_progress, planner_status, PLANNING, WAITING
+from dlo_calibration.ros.markers import plan_markers
+from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
+from dlo_calibration.workspace.worker import Background, Failure
+
+RATE = 5.0  # messages read in a second, out of a stream that may be of any rate
+BURST = 10  # read at once, after a pause
+
+
+class Newest:
+    """
+    The newest message of a topic that could be used.
+
+    A few messages are read as they come.  Of a stream, the newest one waits, and is read at RATE.
+
+    :param read: returns the content of a message's bytes; an InputError refuses it.
+    """
+
+    def __init__(self, read: Callable[[bytes], Any]) -> None:
+        self.content: Any = None
+        self.came = float('-inf')  # when the content came [s]
+        self._read = read
+        self._waiting: tuple[bytes, float] | None = None
+        self._allowed, self._last = float(BURST), float('-inf')
+
+    def hear(self, octets: bytes, now: float) -> None:
+        """Take the bytes of a message that came at the time `now` [s]; they replace those that wait."""
+        self._waiting = octets, now
+
+    def due(self, now: float) -> bool:
+        """Return whether a message waits that may be read at the time `now` [s]."""
+        if self._waiting is None:
+            return False
+        self._allowed = min(BURST, self._allowed + RATE * (now - self._last))
+        self._last = now
+        return self._allowed >= 1.0
+
+    def read(self) -> bool:
+        """
+        Read the message that waits; return whether there was one.
+
+        :raises InputError: if it cannot be used; the content stays as it was.
+        """
+        if self._waiting is None:
+            return False
+        (octets, came), self._waiting = self._waiting, None
+        self._allowed -= 1.0
+        self.content = self._read(octets)
+        self.came = came
+        return True
+
+
+PLAN, PUBLISH = 'plan', 'publish'  # modes
+WORDS = {'true': True, 'false': False}
+
+
+@dataclass(frozen=True)
+class PlannerOptions(PlanOptions):
+    """Everything that a user of the node can set, with what a plan alone does not have."""
+
+    description: str = declared(
+        '', 'path of the result.xml of the DLO, relative to the working directory, which the node then '
+        'publishes on ~/dlo_description; empty: the document that comes there', of=MACHINE)
+    mode: str = declared(
+        PLAN, 'what the node does: plan makes plans; publish only serves the description on '
+        '~/dlo_description, latched, as robot_description is served', choices=(PLAN, PUBLISH), of=MACHINE)
+    frame_pose: str = declared(
+        '', "pose of the chains' frame in the table's frame, whose z is up: x y z [m] and a quaternion qx qy "
+        'qz qw; plans are in the frame of the chains, too, while reach and no_go are in that of the table; '
+        'empty: that of the description, with which the calibrator read the chains', of=MACHINE)
+    simulation: tuple[str, ...] = declared(
+        (), "options of the simulation that replace those of the description, each 'name=value', e.g. "
+        f"'table_height=0.72'; the names are {', '.join(SIMULATION)}", of=MACHINE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.frame_pose:
+            Pose.of(self.frame_pose)
+        self.replacing()
+
+    def replacing(self) -> Mapping[str, Any]:
+        """
+        Return the options that replace those of the description, by name.
+
+        :raises InputError: for an unknown name or a bad value.
+        """
+        known = {one.name: one for one in Options.declarations() if one.name in SIMULATION}
+        values: dict[str, Any] = {}
+        for text in self.simulation:
+            name, equals, value = text.partition('=')
+            if not equals or name not in known:
+                raise InputError('parameter simulation', repr(text), "'name=value' with a name out of "
+                                 f'{", ".join(SIMULATION)}', 'correct it')
+            values[name] = _read(known[name], value)
+        Options.of(values)
+        return {**values, 'frame_pose': self.frame_pose} if self.frame_pose else values
+
+    def check_together(self) -> None:
+        """
+        Check options that depend on one another.
+
+        :raises InputError: if there is nothing to publish.
+        """
+        if self.mode == PUBLISH and not self.description:
+            raise InputError('parameter description', 'an empty text', 'a path, in the mode publish',
+                             'name the result.xml to publish')
+
+
+def _read(declaration: Declaration, text: str) -> Any:
+    """Convert a text to the type of an option; return it unchanged if that fails."""
+    kind = type(declaration.default)
+    try:
+        return WORDS[text] if kind is bool else kind(text)
+    except (KeyError, ValueError):
+        return text
+
 
 CHAIN, GOAL, DESCRIPTION = 'chain', 'goal_chain', 'dlo_description'
 ACTION, STEPS = 'action', 'steps'
@@ -64,16 +166,7 @@ PATIENCE = 0.5  # s that closing waits for the planning thread
 Event = Union[PlanProgress, Plan, Failure]
 
 
-class PlanFunction(Protocol):
-    """Finds actions, as `dlo_calibration.planning.planner.plan` does."""
-
-    def __call__(self, found: Description, start: Any, goal: Any, options: PlannerOptions, *,
-                 simulation: Options, on_progress: Callable[[PlanProgress], None],
-                 should_stop: Callable[[], bool], make_simulator: SimulatorFactory) -> Plan:
-        """Return the plan."""
-
-
-class PlannerSession:
+class PlannerSession(NodeSession[PlannerOptions]):
     """
     Keeps the newest chain, goal and description, plans on request, and publishes the plan.
 
@@ -81,73 +174,44 @@ class PlannerSession:
 
     :param types: the message classes that `graph` encodes.
     :param make_simulator: builds the engine, in the planning thread.
-    :param plan: finds the actions.
     :param clock: a monotonic clock [s].
     """
 
-    status_period = 1.0  # s between two messages about no more than refusals
-
-    def __init__(self, graph: Graph[PlannerOptions], types: MessageTypes, make_simulator: SimulatorFactory, *,
-                 plan: PlanFunction = find_plan,
-                 clock: Callable[[], float] = time.monotonic) -> None:
-        self._graph, self._types, self._clock = graph, types, clock
-        self._find = plan
+    def __init__(self, graph: NodeInterface[PlannerOptions], types: MessageTypes,
+                 make_simulator: SimulatorFactory, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(graph, types, INPUT_TYPES, NodeState(WAITING), clock)
+        self.requests = {'plan': self._begin, 'stop': self._stop}
         self._make_simulator = make_simulator
         self._background: Background[Event] = Background('plan')
-        self._chains = {kind: Newest(lambda octets, kind=kind: self._chain(kind, octets))  # type: ignore[misc]
-                        for kind in (CHAIN, GOAL)}
-        self._descriptions = Newest(self._described)
-        self._found: Description | None = None
+        self._newest = {
+            CHAIN: Newest(partial(self._chain, CHAIN)), GOAL: Newest(partial(self._chain, GOAL)),
+            DESCRIPTION: Newest(self._described)}
+        self._description: Description | None = None
         self._origin = ''  # of the description
-        self._state, self._detail, self._last_refusal = WAITING, '', ''
-        self._refusals = Refusals()
-        self._status: dict[str, Any] = {}  # content of the last message
-        self._told = float('-inf')  # when it was sent [s]
         self._progress: PlanProgress | None = None  # the newest, if it was not sent
         self._sent = float('-inf')  # when the last progress was sent [s]
         self._plan: Plan | None = None
-        self._plans, self._under_way = 0, False
+        self._plans, self.planning = 0, False  # whether a plan is under way
         self._frame_id = ''  # of the chains that are planned with
         self._back: Pose | None = None  # of the table's frame in that of the chains
         self._report()
 
-    @property
-    def planning(self) -> bool:
-        """Tell whether a plan is under way."""
-        return self._under_way
-
     def hear(self, kind: str, octets: bytes) -> None:
-        """Take a message that came on an input topic; of a stream, not each one is read."""
-        self._newest(kind).hear(octets, self._clock())
+        """Take a message that came on an input topic; of a stream, only some are read."""
+        self._newest[kind].hear(octets, self._clock())
         self._read_due(kind)
 
-    def describe(self, found: Description, origin: str) -> None:
+    def describe(self, description: Description, origin: str) -> None:
         """
         Plan with this description from now on.
 
         :param origin: where it came from, in words.
         """
-        self._found, self._origin = found, origin
-        for problem in found.problems:
+        self._description, self._origin = description, origin
+        for problem in description.problems:
             self._graph.warn(f'{origin}: {problem}')
-        self._graph.info(f'description from {origin}: a DLO of {found.length:.3g} m')
+        self._graph.info(f'description from {origin}: a DLO of {description.length:.3g} m')
         self._report()
-
-    def refuse(self, text: str) -> None:
-        """Tell why something was refused, in the log and in ``~/status``; a repeated reason not each time."""
-        self._last_refusal = self._refusals.add(told(text))
-        self._tell_refusals()
-
-    def request(self, name: str) -> tuple[bool, str]:
-        """Serve a request `plan` or `stop`; return whether that succeeded, and the answer."""
-        try:
-            answer = {'plan': self._begin, 'stop': self._stop}[name]()
-        except Exception as error:
-            answer = str(error) if isinstance(error, DloCalibrationError) else f'{error!r}; {DEFECT}'
-            self.refuse(answer)
-            return False, answer
-        self._report()
-        return True, answer
 
     def tick(self) -> None:
         """Do what is due now; the node calls this many times a second."""
@@ -160,41 +224,31 @@ class PlannerSession:
         self._tell_refusals()
         self._report()
 
-    def fail(self, text: str, *log: str) -> None:
-        """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
-        self._state, self._detail = FAILED, told(text)
-        for line in log or (text,):
-            self._graph.error(line)
-        self._report()
-
     def close(self) -> None:
         """End a plan under way, without publishing it."""
         self._background.stop()
         self._background.join(PATIENCE)
-        for text in self._refusals.rest():
+        for text in self._situation.counted.rest():
             self._graph.warn(text)
 
     # Messages
 
-    def _newest(self, kind: str) -> Newest[Any]:
-        return self._descriptions if kind == DESCRIPTION else self._chains[kind]
-
     def _read_due(self, kind: str) -> None:
-        if self._newest(kind).due(self._clock()):
+        if self._newest[kind].due(self._clock()):
             self._read(kind)
 
     def _read(self, kind: str) -> None:
-        """Read the message that waits, if there is one; a bad one is refused, and changes nothing."""
+        """Read the message that waits, if any; a refused one changes nothing."""
         try:
-            new = self._newest(kind).read()
+            new = self._newest[kind].read()
         except Exception as error:  # a defect of this package must not end the session
-            self.refuse(why(error, kind))
+            self.refuse(refusal_text(error, kind))
             return
-        if new and kind == DESCRIPTION and self._descriptions.content is not None:
-            self.describe(self._descriptions.content, f'~/{DESCRIPTION}')
+        if new and kind == DESCRIPTION:
+            self.describe(self._newest[kind].content, f'~/{DESCRIPTION}')
 
     def _chain(self, kind: str, octets: bytes) -> ChainMessage:
-        message = read(kind, decoded(self._graph, kind, INPUT_TYPES[kind], octets))
+        message = read(kind, self._decoded(kind, octets))
         assert isinstance(message, ChainMessage)
         return message
 
@@ -202,7 +256,7 @@ class PlannerSession:
         if len(octets) > LARGEST_DESCRIPTION:
             raise InputError(DESCRIPTION, f'{len(octets)} bytes', f'at most {LARGEST_DESCRIPTION}',
                              'check what publishes it')
-        return read_description(decoded(self._graph, DESCRIPTION, INPUT_TYPES[DESCRIPTION], octets).data)
+        return read_description(self._decoded(DESCRIPTION, octets).data)
 
     # Requests
 
@@ -215,28 +269,29 @@ class PlannerSession:
         if missing := self._missing():
             raise InputError('~/plan', f'no {", no ".join(missing)}', 'one of each',
                              'send it, then call ~/plan again')
-        start, goal, found = self._chains[CHAIN].content, self._chains[GOAL].content, self._found
-        assert start is not None and goal is not None and found is not None
+        start, goal, description = self._newest[CHAIN].content, self._newest[GOAL].content, self._description
+        assert description is not None
         if goal.frame_id != start.frame_id:
             raise InputError(str(goal), f'frame_id {goal.frame_id!r}',
                              f'that of the chain, {start.frame_id!r}', 'send both in one frame')
         options = self._graph.options()
-        simulation = _simulation(found, options)
+        simulation = _simulation(description, options)
         pose = simulation.pose
         begin, end = (chain.chain if pose is None else pose.chain(chain.chain) for chain in (start, goal))
-        checked(found, begin, end, simulation, options)
+        checked(description, begin, end, simulation, options)
 
         def work(should_stop: Callable[[], bool]) -> Event:
-            return self._find(found, begin, end, options, simulation=simulation,
-                              on_progress=self._background.events.put, should_stop=should_stop,
-                              make_simulator=self._make_simulator)
+            return plan(description, begin, end, options, simulation=simulation,
+                        on_progress=self._background.events.put, should_stop=should_stop,
+                        make_simulator=self._make_simulator)
 
         self._background.join()  # it has put its last event, so it ends now
         self._background.begin(work)
-        self._state, self._detail, self._frame_id, self._under_way = PLANNING, FIRST, start.frame_id, True
+        self._situation.state, self._situation.detail = PLANNING, FIRST
+        self._frame_id, self.planning = start.frame_id, True
         self._plan, self._progress, self._plans = None, None, self._plans + 1
         self._back = None if pose is None else pose.inverse
-        age = self._clock() - self._chains[CHAIN].came
+        age = self._clock() - self._newest[CHAIN].came
         return f'plan {self._plans} begins, from the {start}, which came {age:.1f} s ago, to the {goal}'
 
     def _stop(self) -> str:
@@ -247,20 +302,21 @@ class PlannerSession:
 
     def _missing(self) -> list[str]:
         """Return the names of the inputs that have not come."""
-        return [*(kind for kind, newest in self._chains.items() if newest.content is None),
-                *([] if self._found else [DESCRIPTION])]
+        return [*(kind for kind in (CHAIN, GOAL) if self._newest[kind].content is None),
+                *([] if self._description else [DESCRIPTION])]
 
     # Events of the planning thread
 
     def _take(self, event: Event) -> None:
         if isinstance(event, PlanProgress):
             self._progress = event
-            self._detail = '' if self._detail == FIRST else self._detail
+            if self._situation.detail == FIRST:
+                self._situation.detail = ''
         elif isinstance(event, Failure):
-            self._under_way = False
+            self.planning = False
             self.fail(event.text, f'no plan: {event.text}', *filter(None, [event.details]))
         else:
-            self._under_way = False
+            self.planning = False
             try:
                 self._finish(event)
             except Exception as error:  # it could not be published
@@ -277,10 +333,10 @@ class PlannerSession:
             # With use_sim_time and no /clock, the node's time is 0, which is no stamp of an action.
             message = action_message(sent.actions[0].action.hands, stamp or NANOSECONDS, self._frame_id)
             self._send(ACTION, action_trajectory(self._types, message))
-        self._state, self._plan = DONE, plan
-        self._detail = outcome(plan) if plan.reached else f'{outcome(plan)} The search: {plan.stop_reason}.'
-        self._graph.info(f'plan {self._plans}: {self._detail}')
-        for remark in plan.remarks:
+        detail = outcome(plan) if plan.reached else f'{outcome(plan)} The search: {plan.stop_reason}.'
+        self._situation.state, self._situation.detail, self._plan = DONE, detail, plan
+        self._graph.info(f'plan {self._plans}: {detail}')
+        for remark in plan.warnings:
             self._graph.warn(remark)
         self._report()
 
@@ -293,38 +349,30 @@ class PlannerSession:
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        missing, detail = self._missing(), self._detail
-        if self._state == WAITING:
+        situation, missing = self._situation, self._missing()
+        detail = situation.detail
+        if situation.state == WAITING:
             detail = f'for {", ".join(f"~/{name}" for name in missing or ["plan"])}'
         content: dict[str, Any] = {
-            'state': self._state, 'detail': detail, 'missing': missing, 'last_refusal': self._last_refusal,
-            'description': self._origin, 'plans': self._plans}
-        changed = {name for name, value in content.items() if value != self._status.get(name, content)}
+            'state': situation.state, 'detail': detail, 'missing': ' '.join(missing),
+            'last_refusal': situation.last_refusal, 'description': self._origin, 'plans': self._plans}
         # A stream that is refused changes its count with each message.
-        if changed and (changed != {'last_refusal'} or self._clock() - self._told >= self.status_period):
-            self._status, self._told = content, self._clock()
-            self._send('status', planner_status(self._types, stamp=self._graph.stamp(), plan=self._plan,
-                                                **content))
-
-    def _tell_refusals(self) -> None:
-        if texts := self._refusals.due(self._clock()):
-            for text in texts:
-                self._graph.warn(text)
-            self._report()
+        if self._status_is_due(content, 'last_refusal'):
+            self._send('status', planner_status(self._types, self._graph.stamp(), content, self._plan))
 
     def _send(self, name: str, message: Any) -> None:
         self._graph.publish(name, self._graph.encode(name, message))
 
 
-def _simulation(found: Description, options: PlannerOptions) -> Options:
+def _simulation(description: Description, options: PlannerOptions) -> Options:
     """
     Return the options with which the DLO is simulated: those of its calibration, unless others replace them.
 
     :raises InputError: if it has a scene that cannot be used.
     """
     replacing = options.replacing()
-    if found.refusal is not None and 'scene' not in replacing:
-        raise InputError(DESCRIPTION, f'a scene that cannot be used ({found.refusal.came})', 'one that can',
-                         "set the parameter description to a result.xml beside its scene, or 'scene=PATH' in "
-                         'the parameter simulation')
-    return Options.of({**found.options, **replacing})
+    if description.refusal is not None and 'scene' not in replacing:
+        raise InputError(DESCRIPTION, f'a scene that cannot be used ({description.refusal.came})',
+                         'one that can', 'set the parameter description to a result.xml beside its scene, '
+                         "or 'scene=PATH' in the parameter simulation")
+    return Options.of({**description.options, **replacing})

@@ -6,37 +6,30 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from itertools import count
+import itertools
 from pathlib import Path
 import time
 from typing import Callable, Mapping, Sequence
 
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.identity import calibration_digest
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.errors import InputError, unwritable
+from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.log import EvaluationLog
-from dlo_calibration.files.evaluations import write_evaluations
 from dlo_calibration.files.recording import RecordingError, SessionWriter
-from dlo_calibration.files.result import write_result
-from dlo_calibration.files.taken_back import mark
 from dlo_calibration.model.trial import Trial
 from dlo_calibration.report.page import Origin, repeating_command
-from dlo_calibration.ros.report_writer import ReportWriter
+from dlo_calibration.workspace.folder import EVALUATIONS, REPORT, RESULT, session_log, write_values
+from dlo_calibration.workspace.report_writer import ReportWriter
 from dlo_calibration.writing import Attempts
-
-FILES = (('result', '.xml'), ('evaluations', '.csv'), ('report', '.html'))  # of a result
 
 
 class Recorder:
     """
-    Records one session after the other; a failing disk makes no method raise.
+    Records one session after the other; no method raises if the disk fails, and what works is still written.
 
-    What cannot be written any more does not prevent the rest.
-
-    :param on_failure: called with each thing that cannot be written and the reason, and when a session
-        ends, with all that its folder lacks.
+    :param on_failure: called with a warning for each thing that cannot be written, and at the end of a
+        session with a list of them.
     :param make_simulator: for the report of a result.
     """
 
@@ -76,7 +69,7 @@ class Recorder:
         self._write(lambda session: session.write(topic, kind, octets), self._calibrated)
 
     def flush(self) -> None:
-        """Give the messages that wait in a group to the operating system."""
+        """Write the messages that wait in a group."""
         self._write(SessionWriter.flush)
 
     def dropped(self, counts: Mapping[str, int]) -> None:
@@ -85,20 +78,22 @@ class Recorder:
 
     def taken_back(self, first: int, last: int) -> None:
         """Record that the messages of a trial, stamped from `first` to `last` [ns], are left out."""
-        self._write(lambda session: session.write_mark(mark(first, last)))
+        self._write(lambda session: session.write_discard(first, last))
 
     def start(self, trials: Sequence[Trial], options: Options) -> EvaluationLog | None:
         """
-        Record that a calibration starts, on the messages recorded so far; return the log of its evaluations.
+        Record that a calibration starts on the messages so far; return its log, see `session_log`.
 
-        The log lies beside the sessions and is named after the trials and options, so that another session
-        with the same ones finds it after an interruption. It is removed when the result is on the disk.
+        The log is removed when the result is on the disk.
 
         :returns: None if the option `record` is not set, or the log cannot be opened.
-        :raises InputError: if the scene cannot be read.
         """
-        self._log = self._open_log(trials, options) if options.record else None
-        self._written = False
+        self._log, self._written = None, False
+        if options.record:
+            try:
+                self._log = session_log(Path(options.output_directory).expanduser(), trials, options)
+            except InputError as error:
+                self._on_failure(f'{error}; this calibration could not go on after an interruption')
         self._write(lambda session: session.write_options(options.flat()))
         self._write(lambda session: session.write_mark('start'))
         self._calibrated = self._session
@@ -115,86 +110,66 @@ class Recorder:
             self._write(SessionWriter.close, calibrated)
         log, self._log = self._log, None
         if log is not None:
-            with suppress(OSError):  # where nothing can be removed, an old log harms nobody
+            with suppress(OSError):  # an old log harms nobody
                 if not log.evaluations or self._written and not interrupted:
                     log.remove()
             log.close()
-
-    def _open_log(self, trials: Sequence[Trial], options: Options) -> EvaluationLog | None:
-        folder = Path(options.output_directory).expanduser()
-        name = f'dlo_unfinished_{calibration_digest(trials, options)}.log'
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            return EvaluationLog(folder / name)
-        except OSError as error:
-            self._on_failure(str(unwritable(folder, error, 'folder')))
-        except InputError as error:
-            self._on_failure(f'{error}; this calibration could not go on after an interruption')
-        return None
 
     def result(self, result: CalibrationResult, options: Options) -> str:
         """
         Write result.xml and evaluations.csv into the folder of the calibration's session.
 
-        report.html follows some seconds later.  The files of a result before become result_1.xml, ...
+        report.html follows some seconds later. The files of an earlier result become result_1.xml, ...
 
-        :returns: where these are now, in words; empty if there is none.
+        :returns: a sentence about the earlier result; empty if there is none.
         """
         if self._calibrated is None:
             return ''
-        folder, older = self._calibrated.path, ''
-        attempts, names = Attempts(folder), [f'{stem}{kind}' for stem, kind in FILES]
-        if any((folder / name).exists() for name in names):
-            number = next(number for number in count(1) if not any(
-                (folder / f'{stem}_{number}{kind}').exists() for stem, kind in FILES))
-            older = f'_{number}'
-            for stem, kind in FILES[:2]:
-                with suppress(OSError):  # it was not written then, or is replaced now
-                    (folder / f'{stem}{kind}').replace(folder / f'{stem}{older}{kind}')
-        with attempts.attempt(names[0]):
-            write_result(folder / names[0], result, options.flat())
-        with attempts.attempt(names[1]):
-            write_evaluations(folder / names[1], result)
+        folder = self._calibrated.path
+        older = _free_suffix(folder)
+        for name in (RESULT, EVALUATIONS):
+            with suppress(OSError):  # it was not written then, or is replaced now
+                if older:
+                    (folder / name).replace(folder / _numbered(name, older))
+        attempts = Attempts(folder)
+        write_values(attempts, result, options)
         self._written = not attempts.failure
         if attempts.failure:
             self._miss(folder, attempts.failure)
         origin = Origin(folder.name, repeating_command(folder.name, options), options)
-        self._reporter.begin(folder / names[2], result, origin,
-                             folder / f'report{older}.html' if older else None)
-        return f'{folder / names[0]} is the newest result; the one before is result{older}.xml there' \
+        self._reporter.begin(folder / REPORT, result, origin,
+                             folder / _numbered(REPORT, older) if older else None)
+        return f'{folder / RESULT} is the newest result; the one before is {_numbered(RESULT, older)} there' \
             if older else ''
 
-    def tell(self) -> None:
-        """Call `on_failure` for each report that could not be written since the last call."""
+    def report_failures(self) -> None:
+        """Call `on_failure` for each page that could not be written since the last call."""
         for path, why in self._reporter.failures():
             self._miss(path.parent, f'{path.name}: {why}')
 
     def end(self) -> None:
         """
-        End the session, and tell what its folder lacks; without one, do nothing.
+        End the session, with a warning if its folder is incomplete; without a session, do nothing.
 
         While a calibration is under way, its session stays open until that ends.
         """
         if self._session is not self._calibrated:
             self._write(SessionWriter.close)
         self._session = None
-        self._conclude()
+        self.report_failures()
+        missing, self._missing = self._missing, {}
+        for folder, texts in missing.items():
+            self._on_failure(f'session {folder} is incomplete; could not be written: {"; ".join(texts)}')
 
     def close(self) -> None:
-        """End the session, wait for its report, and tell what its folder lacks."""
+        """End the session, and wait for its report; warn if the folder is incomplete."""
         self.finish(interrupted=True)
         self._write(SessionWriter.close)
         self._reporter.close()
         self.end()
 
-    def _conclude(self) -> None:
-        self.tell()
-        missing, self._missing = self._missing, {}
-        for folder, texts in missing.items():
-            self._on_failure(f'session {folder} is incomplete; could not be written: {"; ".join(texts)}')
-
     def _miss(self, folder: Path, what: str, text: str = '') -> None:
-        """Tell now, and when the session ends, that something could not be written; `text` is for now."""
+        """Warn now, and at the end of the session, that something could not be written; `text` is for now."""
         self._missing.setdefault(folder, []).append(what)
         self._on_failure((text or f'session {folder}: could not be written: {what}')
                          + '; once there is room, ~/reset begins a new session')
@@ -202,7 +177,7 @@ class Recorder:
     def _write(self, write: Callable[[SessionWriter], None], to: SessionWriter | None = None) -> None:
         """Write to a session, by default the one that is being recorded."""
         session = self._session if to is None else to
-        if session is None or session.failed:
+        if session is None or session.failure:
             return
         try:
             write(session)
@@ -215,3 +190,17 @@ def _cause(error: RecordingError) -> str:
     """Return why a session could not be written, in few words."""
     cause = error.__cause__
     return getattr(cause, 'strerror', None) or str(cause or error)
+
+
+def _numbered(name: str, suffix: str) -> str:
+    """Return the name of a file of an older result."""
+    stem, dot, kind = name.partition('.')
+    return f'{stem}{suffix}{dot}{kind}'
+
+
+def _free_suffix(folder: Path) -> str:
+    """Return the suffix that the files of an older result get, e.g. ``_1``; empty if there are none."""
+    names = (RESULT, EVALUATIONS, REPORT)
+    suffixes = itertools.chain([''], (f'_{number}' for number in itertools.count(1)))
+    return next(suffix for suffix in suffixes if not any(
+        (folder / _numbered(name, suffix)).exists() for name in names))

@@ -2,44 +2,216 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-CalibrationSession: what the node knows, and what it does with a message, a request or the passing of time.
+CalibrationSession: the state of the node `calibrator`, and its reactions to messages, requests and time.
 
-It imports no rclpy: it reaches ROS through a `Graph`, which the node implements.
+It imports no rclpy: it reaches ROS through a `NodeInterface`, which the node implements.
 Every error is reported in the log and in ``~/status``, and the node goes on working.
 """
 
 from __future__ import annotations
 
+from collections import Counter, deque
+from dataclasses import dataclass, field
 import time
-from typing import Callable, Mapping
+from typing import Any, Callable, Iterator, Mapping
 
-from dlo_calibration.calibration.automatic import choose
+from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.engines import SimulatorFactory
-from dlo_calibration.calibration.live_information import LiveInformation
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.progress import Progress
 from dlo_calibration.calibration.result import CalibrationResult
-from dlo_calibration.calibration.worker import Failure, Notice, Worker
-from dlo_calibration.errors import DEFECT, DloCalibrationError, InputError, told
+from dlo_calibration.errors import InputError, safe_line
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, MessageTypes, read
-from dlo_calibration.messages.collector import TrialCollector
-from dlo_calibration.messages.stamp_order import StampOrder, went_back
-from dlo_calibration.messages.trial_builder import Message
+from dlo_calibration.files.result import description_document
+from dlo_calibration.inference.trial_information import TrialInformation
+from dlo_calibration.messages.codec import (
+    GOAL,
+    INITIAL,
+    INPUT_TYPES,
+    Message,
+    MessageTypes,
+    OUTPUT_TYPES,
+    read,
+)
+from dlo_calibration.messages.collector import KEPT, StampOrder, TrialCollector, went_back
+from dlo_calibration.model.trial import Trial
 from dlo_calibration.report import sentences
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.ros.collecting import Collecting
-from dlo_calibration.ros.graph import decoded, Graph, why
-from dlo_calibration.ros.outlet import Outlet
+from dlo_calibration.ros.markers import alike, markers
+from dlo_calibration.ros.node_session import NodeInterface, NodeSession, NodeState, refusal_text
 from dlo_calibration.ros.recorder import Recorder
-from dlo_calibration.ros.situation import Calibration, Pace, Situation
+from dlo_calibration.workspace.live_information import LiveInformation
+from dlo_calibration.workspace.worker import Failure, Notice, Progress, Worker
+
+
+@dataclass
+class Pace:
+    """
+    When to repeat something that is repeated if needed, but not too often.
+
+    :param wanted: whether it is needed.
+    :param last: time when it was done last [s].
+    """
+
+    wanted: bool = False
+    last: float = float('-inf')
+
+
+@dataclass
+class Dropped:
+    """
+    Messages that were dropped.
+
+    :param counts: how many of each kind.
+    :param reported: how many of them have been reported, most recently at the time `last` [s].
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    reported: Counter[str] = field(default_factory=Counter)
+    last: float = float('-inf')
+
+    def due(self, now: float, at_once: bool) -> list[str]:
+        """Return the warnings that are due at the time `now` [s], at most once a second."""
+        new = self.counts - self.reported
+        if not new or not at_once and now - self.last <= 1.0:
+            return []
+        self.reported, self.last = Counter(self.counts), now
+        return [f'{kind}: {count} message(s) were dropped, as they came faster than they can be read; '
+                'publish fewer a second' for kind, count in new.items()]
+
+
+@dataclass
+class Situation(NodeState):
+    """
+    What a reset forgets, besides the trials.
+
+    :param refusals: the latest ones, which are not reported again.
+    :param heard: time of the last action or goal chain [s].
+    :param started: whether a calibration was started, so that `start_after_trials` starts none.
+    :param result: of the last calibration.
+    :param information: about the newest trial that was appraised.
+    """
+
+    state: str = 'collecting'
+    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT))
+    heard: float = float('-inf')
+    started: bool = False
+    result: CalibrationResult | None = None
+    information: TrialInformation | None = None
+    dropped: Dropped = field(default_factory=Dropped)
+    markers: Pace = field(default_factory=Pace)
+    appraisal: Pace = field(default_factory=Pace)
+
+
+@dataclass
+class CalibrationUnderWay:
+    """
+    A calibration under way.
+
+    :param situation: of the session in which it started, which may have ended since.
+    :param sent: time of its last progress message [s].
+    """
+
+    options: Options
+    progress: Progress
+    situation: Situation
+    sent: float = float('-inf')
+
+
+ANEW = 'collecting the messages so far anew, as options have changed'  # detail of the status
+
+
+class Collecting:
+    """
+    Collects messages with the options in force.
+
+    A stream of minutes has 10,000 messages, which take seconds to collect anew; a node that answers meanwhile
+    does so in steps.  Until the last step, the trials are those of the former options.
+
+    :ivar options: with which `collector` has collected.
+    :ivar left: how many messages have to be collected anew.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.options, self.collector = options, TrialCollector(options)
+        self.left = 0
+        self._next, self._other = options, self.collector  # once nothing is left
+        self._steps: Iterator[int] = iter(())
+
+    def change(self, options: Options) -> None:
+        """Begin to collect anew with other options, where those of the observation differ."""
+        if options != self._next:
+            self._next = options
+            self._other, self._steps = self.collector.with_options(options)
+            self.step()
+
+    def step(self) -> bool:
+        """Collect the next message anew; return whether none is left."""
+        self.left = next(self._steps, 0)
+        if not self.left:
+            self.options, self.collector = self._next, self._other
+        return not self.left
+
+
+OF_CALIBRATION = ('progress', 'result', 'dlo_description')  # recorded in the session that was calibrated
+PROGRESS_PERIOD = 0.1  # s between two progress messages: nobody reads faster, and each is recorded
+
+
+class Outlet:
+    """
+    Records and sends messages; progress and markers not too often.
+
+    :param types: the message classes that `graph` encodes.
+    :param clock: a monotonic clock [s].
+    """
+
+    def __init__(self, graph: NodeInterface[Options], types: MessageTypes, recorder: Recorder,
+                 clock: Callable[[], float]) -> None:
+        self._graph, self._types, self._recorder, self._clock = graph, types, recorder, clock
+        self._shown: tuple[CalibrationResult | None, tuple[Trial, ...]] = None, ()  # in the last markers
+
+    def send(self, name: str, message: Any) -> None:
+        """Record a message, then publish it: whatever a subscriber received is on the disk."""
+        octets = self._graph.encode(name, message)
+        record = self._recorder.of_calibration if name in OF_CALIBRATION else self._recorder.message
+        record(self._graph.topic(name), OUTPUT_TYPES[name], octets)
+        self._graph.publish(name, octets)
+
+    def progress(self, calibration: CalibrationUnderWay, at_once: bool = False) -> None:
+        """Send the newest evaluation, unless it has been sent."""
+        progress = calibration.progress
+        if progress.newest is None or not at_once and self._clock() - calibration.sent < PROGRESS_PERIOD:
+            return
+        self.send('progress', diagnostics.progress(self._types, progress, self._graph.stamp()))
+        progress.newest, calibration.sent = None, self._clock()
+
+    def result(self, result: CalibrationResult, options: Options) -> None:
+        """Send a result, and the description of the DLO that it gives."""
+        self.send('result', diagnostics.result(self._types, result, self._graph.stamp()))
+        self.send('dlo_description', self._types.build(
+            OUTPUT_TYPES['dlo_description'], data=description_document(result, options.flat()).decode()))
+
+    def markers(self, situation: Situation, collector: TrialCollector, at_once: bool) -> None:
+        """Send the markers of all trials, unless the last ones show the same."""
+        # Each message has the markers of all trials, and is recorded: the more trials, the fewer messages.
+        now, period = self._clock(), 1.0 + 0.1 * collector.count
+        if not at_once and not (
+                situation.markers.wanted and collector.count and now - situation.markers.last >= period):
+            return
+        situation.markers = Pace(last=now)
+        result, trials = situation.result, collector.trials
+        if trials and result is self._shown[0] and alike(trials, self._shown[1]):
+            return
+        self._shown = result, trials
+        self.send('markers', markers(self._types, trials, stamp=self._graph.stamp(),
+                                     frame_id=collector.frame_id, result=result, pose=collector.pose))
+
 
 QUIET = 0.5  # s without action or goal chain, after which the last trial counts as complete
 PATIENCE = 10.0  # s that closing waits for each worker
 UNDER_WAY = 1.0  # s for which messages from before a jump of the clock may still arrive
 
 
-class CalibrationSession:
+class CalibrationSession(NodeSession[Options]):
     """
     Collects trials, calibrates on request, and publishes progress, result, status and markers.
 
@@ -50,17 +222,19 @@ class CalibrationSession:
     :param clock: a monotonic clock [s].
     """
 
-    def __init__(self, graph: Graph[Options], types: MessageTypes, make_simulator: SimulatorFactory,
+    def __init__(self, graph: NodeInterface[Options], types: MessageTypes, make_simulator: SimulatorFactory,
                  clock: Callable[[], float] = time.monotonic) -> None:
-        self._graph, self._types, self._clock = graph, types, clock
+        super().__init__(graph, types, INPUT_TYPES, Situation(), clock)
+        self._situation: Situation
+        self.requests = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
+                         'discard_last': self._discard_last}
         self._make_simulator = make_simulator
         self.collecting = Collecting(graph.options())
         self._worker = Worker(make_simulator)
         self._appraiser = LiveInformation(make_simulator)
         self._recorder = Recorder(self._fail_to_record, make_simulator)
         self._outlet = Outlet(graph, types, self._recorder, clock)
-        self._situation = Situation()
-        self._calibration: Calibration | None = None
+        self._calibration: CalibrationUnderWay | None = None
         self._order = StampOrder()
         self._began = self._clock()
         self.behind = False  # whether messages wait; appraisals and markers would delay them
@@ -73,7 +247,7 @@ class CalibrationSession:
 
     @property
     def calibrating(self) -> bool:
-        """Tell whether a calibration is under way."""
+        """Whether a calibration is under way."""
         return self._calibration is not None
 
     def hear(self, kind: str, octets: bytes, flush: bool = True) -> None:
@@ -86,7 +260,7 @@ class CalibrationSession:
         if message and self._order.clock_went_back(message):
             self._begin_anew(went_back(self._order.newest, message.stamp))
         if message and self._clock() - self._began < UNDER_WAY and self._order.left_over(message):
-            self.refuse(f'{message}: got a stamp from before the clock went back, expected a later one; '
+            self.refuse(f'{message}: a stamp from before the clock went back; expected a later one; '
                         'it belongs to the former session')
             return
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, flush)
@@ -100,11 +274,11 @@ class CalibrationSession:
             self._situation.state, self._situation.detail = 'collecting', ''
 
     def drop(self, counts: Mapping[str, int]) -> None:
-        """Take note of messages of some kinds that came, and were dropped."""
+        """Count messages that came and were dropped, by kind."""
         self._situation.dropped.counts.update(counts)
 
     def keep(self, kind: str, octets: bytes) -> None:
-        """Record a message, as no time is left to collect it."""
+        """Record a message without collecting it, as the node ends."""
         self._recorder.message(self._graph.topic(kind), INPUT_TYPES[kind], octets, False)
 
     def flush(self) -> None:
@@ -112,45 +286,28 @@ class CalibrationSession:
         self._recorder.flush()
 
     def refuse(self, text: str) -> None:
-        """Tell why something was refused, in the log and in ``~/status``; a repeated reason not each time."""
-        text, situation = told(text), self._situation
-        situation.refusals.append(text)
-        situation.last_refusal = situation.counted.add(text)
-        self._tell_refusals(situation.counted.due(self._clock()))
-
-    def request(self, name: str) -> tuple[bool, str]:
-        """Serve a request; return whether that succeeded, and the answer."""
-        try:
-            if name != 'stop' and self.calibrating:
-                raise InputError(f'~/{name}', 'a calibration under way', 'none',
-                                 'wait for it, or call ~/stop first')
-            answer = {'start': self._start, 'stop': self._stop, 'reset': self._reset,
-                      'discard_last': self._discard_last}[name]()
-        except Exception as error:
-            answer = str(error) if isinstance(error, DloCalibrationError) else f'{error!r}; {DEFECT}'
-            self.refuse(answer)
-            return False, answer
-        self._report()
-        return True, answer
+        """Report a refusal as other sessions do, and remember it."""
+        self._situation.refusals.append(safe_line(text))
+        super().refuse(text)
 
     def tick(self) -> None:
         """Do what is due now; the node calls this many times a second, and answers others in between."""
         if not self.behind:
             self._show(at_once=False)
         self._take_events()
-        self._recorder.tell()
-        self._tell_refusals(self._situation.counted.due(self._clock()))
+        self._recorder.report_failures()
+        self._tell_refusals()
         self._tell_dropped()
         self._start_by_itself()
         self._appraise()
         self._report()
 
     def change_options(self) -> None:
-        """Take note of the options in force; `collect_anew` collects the messages so far with them."""
+        """Use the options in force from now on; `collect_anew` collects the messages so far with them."""
         self.collecting.change(self._graph.options())
 
     def collect_anew(self) -> None:
-        """Collect one message anew; others wait until none of `collecting` is left."""
+        """Collect one message anew; new messages wait until `collecting.left` is 0."""
         if self.collecting.step():
             self._tell_news()
 
@@ -161,13 +318,6 @@ class CalibrationSession:
             self.collect_anew()
         return self.collecting.options
 
-    def fail(self, text: str, *log: str) -> None:
-        """Report a failure in ``~/status`` and in the log; `log` has the lines of the log if they differ."""
-        self._situation.state, self._situation.detail = 'failed', told(text)
-        for line in log or (text,):
-            self._graph.error(line)
-        self._report()
-
     def close(self) -> None:
         """End the calibration, with its best evaluation so far as the result, then the recording."""
         self._worker.stop()
@@ -177,7 +327,7 @@ class CalibrationSession:
             if not (self._worker.join(PATIENCE) and self._appraiser.join(PATIENCE)):
                 self._graph.warn(f'a simulation did not end within {PATIENCE:.0f} s; it is abandoned')
             self._take_events()
-            self._tell_refusals(self._situation.counted.rest())
+            self._warn(self._situation.counted.rest())
         finally:
             self._recorder.close()
 
@@ -186,9 +336,9 @@ class CalibrationSession:
     def _read(self, kind: str, octets: bytes) -> tuple[Message | None, str]:
         """Return a message, or None and why it cannot be read."""
         try:
-            return read(kind, decoded(self._graph, kind, INPUT_TYPES[kind], octets)), ''
+            return read(kind, self._decoded(kind, octets)), ''
         except Exception as error:  # a defect of this package must not end the session
-            return None, why(error, kind)
+            return None, refusal_text(error, kind)
 
     def _collect(self, message: Message) -> str:
         """Collect a message; return why it is refused, if it is."""
@@ -198,11 +348,11 @@ class CalibrationSession:
             self._collector.add(message)
             self._tell_news()
         except Exception as error:
-            return why(error, message.kind)
+            return refusal_text(error, message.kind)
         return ''
 
     def _tell_news(self) -> None:
-        for refusal in (*self._collector.take_news(), *self._collector.take_doubts()):
+        for refusal in (*self._collector.take_refusals(), *self._collector.take_warnings()):
             self.refuse(str(refusal))
         for early in self._collector.take_early():
             self._graph.info(f'{early.thing}: came before the first initial chain; not used')
@@ -210,12 +360,12 @@ class CalibrationSession:
     def clock_went_back(self, before: int, now: int) -> None:
         """Begin another session, as the node's clock went from one time [ns] back to another."""
         self._graph.hear_waiting()
-        if self._clock() - self._began > UNDER_WAY:  # else the stamps of messages told it first
+        if self._clock() - self._began > UNDER_WAY:  # else the stamps of messages showed it first
             self._begin_anew(went_back(before, now))
 
     def _begin_anew(self, why: str) -> None:
         """Begin another session because the clock went back."""
-        self._order, self._began = self._order.after_jump(), self._clock()
+        self._order, self._began = StampOrder(self._order), self._clock()
         if self._situation.heard == float('-inf'):  # only initial chains came: there is no session to keep
             self.collecting = Collecting(self._graph.options())
             self._graph.warn(why)
@@ -227,7 +377,13 @@ class CalibrationSession:
 
     # Requests
 
+    def _require_idle(self, name: str) -> None:
+        if self.calibrating:
+            raise InputError(f'~/{name}', 'a calibration under way', 'none',
+                             'wait for it, or call ~/stop first')
+
     def _start(self) -> str:
+        self._require_idle('start')
         self._graph.hear_waiting()  # messages sent before the request belong to this calibration
         options = self._take_options()
         known = set(self._situation.refusals)
@@ -243,7 +399,7 @@ class CalibrationSession:
         situation = self._situation
         choice = choose(trials, options)
         progress = Progress(choice.options.evaluations, len(trials), log.evaluations if log else 0)
-        self._calibration = Calibration(options, progress, situation)
+        self._calibration = CalibrationUnderWay(options, progress, situation)
         situation.started, situation.state, situation.detail = True, 'calibrating', log.resumed if log else ''
         self._appraiser.stop()
         situation.appraisal.wanted = True  # again after the calibration, as this one was stopped
@@ -272,11 +428,13 @@ class CalibrationSession:
         return 'the search ends now; the best so far will be the result'
 
     def _reset(self) -> str:
+        self._require_idle('reset')
         self._order = StampOrder()
         self._forget()
         return 'the trials are forgotten'
 
     def _discard_last(self) -> str:
+        self._require_idle('discard_last')
         self._graph.hear_waiting()  # messages sent before the request belong to that trial
         self._take_options()
         before = self._collector.count
@@ -295,8 +453,9 @@ class CalibrationSession:
         self._recorder.end()
         self._appraiser.stop()
         self.collecting = Collecting(self._graph.options())
-        self._tell_refusals(self._situation.counted.rest())
-        self._situation = Situation(state='calibrating' if self.calibrating else 'collecting')
+        self._warn(self._situation.counted.rest())
+        self._status = {}  # the next one is about another session
+        self._situation = Situation('calibrating' if self.calibrating else 'collecting')
         self._began = self._clock()
         self._begin_recording()
         self._show()
@@ -306,7 +465,7 @@ class CalibrationSession:
     def _take_events(self) -> None:
         for event in self._worker.waiting_events():
             if isinstance(event, Notice):
-                self._situation.detail = told(event.text)
+                self._situation.detail = safe_line(event.text)
                 self._graph.warn(event.text)
             elif not isinstance(event, Evaluation):
                 self._finish(event)
@@ -341,7 +500,7 @@ class CalibrationSession:
         self._report()
 
     def _appraise(self) -> None:
-        """Take finished appraisals; start one if trials changed and no calibration is under way."""
+        """Take finished appraisals; start one if trials have changed and no calibration is under way."""
         situation, now = self._situation, self._clock()
         for information in self._appraiser.waiting_information():
             situation.information = information
@@ -356,15 +515,21 @@ class CalibrationSession:
     # Messages of the node
 
     def _tell_dropped(self, at_once: bool = False) -> None:
-        """Tell how many messages were dropped, if that number has changed, at most once a second."""
+        """Warn of dropped messages if there are new ones, at most once a second."""
         if texts := self._situation.dropped.due(self._clock(), at_once):
-            self._tell_refusals(texts)
-            self._recorder.dropped(self._situation.dropped.told)
+            self._warn(texts)
+            self._recorder.dropped(self._situation.dropped.reported)
 
     def _report(self) -> None:
         """Send the status if it differs from the last one."""
-        detail = self.collecting.words or self._situation.detail
-        self._outlet.status(self._situation, self._collector, detail)
+        situation, collector = self._situation, self._collector
+        content: dict[str, Any] = {
+            'state': situation.state, 'trials': collector.count, 'last_refusal': situation.last_refusal,
+            'incomplete': collector.incomplete, 'detail': ANEW if self.collecting.left else situation.detail,
+            'dropped': situation.dropped.reported.total()}
+        about = situation.information
+        if self._status_is_due({**content, 'about': about}, 'last_refusal', 'incomplete', 'dropped'):
+            self._outlet.send('status', diagnostics.status(self._types, self._graph.stamp(), content, about))
 
     def _show(self, at_once: bool = True) -> None:
         self._outlet.markers(self._situation, self._collector, at_once)
@@ -373,12 +538,6 @@ class CalibrationSession:
         self._recorder.begin(self._graph.options())
         if self._recorder.folder is not None:
             self._graph.info(f'recording to {self._recorder.folder}')
-
-    def _tell_refusals(self, texts: list[str]) -> None:
-        for text in texts:
-            self._graph.warn(text)
-        if texts:
-            self._report()
 
     def _fail_to_record(self, text: str) -> None:
         self._situation.last_refusal = text

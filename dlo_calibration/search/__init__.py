@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from typing import Callable, Mapping
 
-from dlo_calibration.search.cma_es import CmaEs
 from dlo_calibration.search.least_squares import LeastSquares
 from dlo_calibration.search.protocol import Hints, Observation, Search
-from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.search.sampling import CmaEs, RandomSearch
 
 __all__ = ['CmaEs', 'Hints', 'LeastSquares', 'Observation', 'RandomSearch', 'Search', 'SEARCHES']
 

@@ -11,11 +11,57 @@ from typing import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import Linearisation
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.linearisation import broyden, Linearisation, TINY
+from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
-from dlo_calibration.search.bounded import bounded_least_squares
 from dlo_calibration.search.protocol import Observation
+
+STEEP = 1e-12  # share of the largest possible slope that counts as none
+
+
+def bounded_least_squares(matrix: Floats, right: Floats, least: Floats, most: Floats) -> Floats:
+    """
+    Return the x (d,) with the least |matrix x - right| within bounds.
+
+    The method is that of Stark and Parker, Bounded-variable least-squares, 1995.  `scipy.optimize.lsq_linear`
+    finds the same up to rounding, but takes longer to load than a short search.
+
+    :param matrix: (m, d); `right` (m,).
+    :param least: (d,) lower bounds; `most` (d,) upper ones, which are above them.
+    """
+    count = len(least)
+    x: Floats = np.clip(np.linalg.lstsq(matrix, right, rcond=None)[0], least, most)
+    free = (x > least) & (x < most)
+    tolerance = STEEP * np.linalg.norm(matrix, axis=0).max(initial=0.0) * np.linalg.norm(right)
+    for _ in range(3 * count + 1):
+        x, free = _solved(matrix, right, least, most, x, free)
+        slope = matrix.T @ (matrix @ x - right)
+        gain = np.where(free, 0.0, np.where(x <= least, -slope, slope))  # by leaving the bound
+        if not count or gain.max() <= tolerance:
+            break
+        free[gain.argmax()] = True
+    return x
+
+
+def _solved(matrix: Floats, right: Floats, least: Floats, most: Floats, x: Floats, free: NDArray[np.bool_]
+            ) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the best x in which only free unknowns change; those that come to a bound stay there."""
+    x, free = x.copy(), free.copy()
+    while free.any():
+        there = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ x[~free], rcond=None)[0]
+        here, low, high = x[free], least[free], most[free]
+        if np.all((there >= low) & (there <= high)):
+            x[free] = there
+            break
+        step = there - here
+        bound = np.where(step < 0, low, high)
+        share = np.divide(bound - here, step, out=np.ones_like(step), where=(there < low) | (there > high))
+        first = share.argmin()
+        x[free] = np.clip(here + share[first] * step, low, high)
+        columns = np.flatnonzero(free)
+        x[columns[first]] = bound[first]
+        free[columns[first]] = False
+    return x, free
 
 #: Largest distance, in each parameter, at which a Jacobian is still valid and two minima count as the same.
 NEAR = 0.03
@@ -63,8 +109,8 @@ class Descent:
         return self.origin is not None and bool(np.abs(self.point - self.origin).max() <= NEAR)
 
     def has_rival(self, starts: Sequence[Observation]) -> bool:
-        """Tell whether a start point costs less than three times the current point: it is as promising."""
-        return any(self.loss.cost(one.residuals) < 3 * self.cost for one in starts)
+        """Tell whether a start point is as promising: it costs less than three times the current point."""
+        return any(self.loss.cost(start.residuals) < 3 * self.cost for start in starts)
 
     def move(self, observation: Observation) -> None:
         """Move to an observed point; keep the Jacobian."""
@@ -100,21 +146,37 @@ class Descent:
         step[columns] = bounded_least_squares(upper, rest, least[movable], most[movable])
         return step
 
+    def axis_steps(self, radius: float) -> list[Floats]:
+        """Return the (d,) step along each principal axis of the model, within unit cube and radius."""
+        columns = np.flatnonzero(self.visible())
+        model = self.model.columns(columns).weighted(self.loss.roots(self.residuals))
+        curvatures, axes = np.linalg.eigh(model.information)
+        steps = []
+        for curvature, axis in zip(curvatures, axes.T, strict=True):
+            step = np.zeros(len(self.point))
+            step[columns] = -axis * (axis @ model.gradient) / max(float(curvature), TINY)
+            share = min(1.0, radius / max(float(np.abs(step).max()), TINY))
+            steps.append(np.clip(self.point + share * step, 0.0, 1.0) - self.point)
+        return steps
+
     def predicted(self, step: Floats) -> float:
         """Return the cost [m^2] that the model predicts after a (d,) step."""
         return self.loss.cost(self.model.predicted(step))
 
-    def update_jacobian(self, one: Observation, base: Floats, before: Floats) -> None:
-        """Update the Jacobian so that it predicts the observed residuals (Broyden's rank-one update)."""
-        if one.residuals is None:
+    def update_jacobian(self, observation: Observation, base: Floats, before: Floats) -> None:
+        """
+        Update the Jacobian so that it predicts the observed residuals.
+
+        :param base: (d,) where the step began; `before` (m,) the residuals there [m].
+        """
+        if observation.residuals is None:
             return
-        step = one.point - base
-        square = float(step @ step)
-        if square < 1e-16:
+        step = observation.point - base
+        if float(step @ step) < 1e-16:
             return
-        surprise = one.residuals - before - self.jacobian @ step
+        surprise = observation.residuals - before - self.jacobian @ step
         self.roughness = float(np.sqrt(np.mean(surprise ** 2)))
-        self.jacobian = self.jacobian + np.outer(surprise, step / square)
+        self.jacobian = broyden(self.jacobian, step, surprise)
 
 
 def _reduced(matrix: Floats, right: Floats) -> tuple[Floats, Floats]:

@@ -11,12 +11,11 @@ from typing import Generator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_calibration.evaluation.linearisation import both_sides, inward, Linearisation, slope, STEP
-from dlo_calibration.evaluation.robust import Huber
+from dlo_calibration.evaluation.linearisation import Differences, Linearisation, STEP
+from dlo_calibration.evaluation.residuals import Huber
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.search.descent import Descent, NEAR
-from dlo_calibration.search.plan import Plan, PlannedSearch
-from dlo_calibration.search.protocol import Hints, Observation
+from dlo_calibration.search.protocol import Batches, Hints, Observation, Search
 from dlo_calibration.search.sobol import Sobol
 
 # Steps and distances are in the unit cube.
@@ -27,45 +26,38 @@ DONE_GAIN = 1e-4  # or is predicted to lower the cost by no more than this share
 COARSE_GAIN = 0.01  # the same for a coarse search: cross-validation would not notice less
 SCAN_RADIUS = 0.1  # of a step from a scanned point; points nearer than this to the minimum are not scanned
 MOST_ITERATIONS = 25  # of one descent
+STALLED = 0.02  # share of the cost; a descent had stalled before its minimum if polishing saves more
+MOST_RESUMED = 4  # times that a descent goes on after it was polished
 
 
-def costs_less(one: Floats, other: Floats) -> bool:
-    """Tell whether the first residuals [m] cost less than the second, by the narrower of their losses."""
-    loss = min(Huber.of(one), Huber.of(other))
-    return loss.cost(one) < loss.cost(other)
+def costs_less(residuals: Floats, others: Floats) -> bool:
+    """Tell whether residuals [m] cost less than others, by the narrower of their losses."""
+    loss = min(Huber.of(residuals), Huber.of(others))
+    return loss.cost(residuals) < loss.cost(others)
 
 
-class LeastSquares(PlannedSearch):
+class LeastSquares(Search):
     """
     Minimise the robust sum of squared residuals within the unit cube.
 
-    The start points fill the cube.  A descent from the best of them takes
-    Gauss-Newton steps within a box (Nocedal and Wright, Numerical Optimization,
-    2nd ed., 10.3).  Finite differences give the Jacobian, and Broyden's update
-    (ibid., 11.1) corrects it after each step.  Descents from other start points
-    follow until the lowest minimum was found twice.
+    The start points fill the cube.  A descent from the best of them takes Gauss-Newton steps within a box
+    (Nocedal and Wright, Numerical Optimization, 2nd ed., 10.3).  Finite differences give the Jacobian, and
+    Broyden's update corrects it after each step.  Descents from other start points follow until two have
+    ended in the lowest minimum.  The difference score of the result, `best`, may not be the lowest.
 
     :param dimension: number of parameters.
     :param seed: of the start points.
-    :param hints: half of the start points have its estimates; parameters that it calls not excited stay.
+    :param hints: half of the start points have its estimates; parameters that are not excited stay.
     """
 
     name = 'least_squares'
 
     def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
-        super().__init__(dimension)
-        self._seed = seed
-        self._hints = Hints.none(dimension) if hints is None else hints
+        super().__init__(dimension, seed, hints)
         # [m] root mean square change of the residuals over the whole range of each parameter.  The smallest
         # one measured is kept: contacts that come and go make columns too large, never too small.
         self._least_effect = np.full(dimension, np.inf)
-        self._lowest: Observation | None = None
         self._descents: list[Descent] = []
-
-    @property
-    def best(self) -> Floats | None:
-        """The (d,) point of lowest robust cost; its difference score may not be the lowest."""
-        return None if self._lowest is None else self._lowest.point
 
     @property
     def model(self) -> Linearisation | None:
@@ -73,35 +65,34 @@ class LeastSquares(PlannedSearch):
         lowest = self._lowest
         if lowest is None or lowest.residuals is None:
             return None
-        near = [(float(np.abs(one.point - lowest.point)[one.visible()].max(initial=0.0)), one.jacobian)
-                for one in self._descents if one.origin is not None]
+        near = [(float(np.abs(descent.point - lowest.point)[descent.visible()].max(initial=0.0)),
+                 descent.jacobian) for descent in self._descents if descent.jacobian.any()]
         distance, jacobian = min(near, key=lambda pair: pair[0], default=(np.inf, np.zeros(0)))
         return Linearisation(lowest.point, lowest.residuals, jacobian) if distance <= NEAR else None
 
-    def tell(self, observations: Sequence[Observation]) -> None:
-        """Take the results of the last `ask`."""
-        for one in observations:
-            if one.residuals is not None and (
-                    self._lowest is None or self._lowest.residuals is None
-                    or costs_less(one.residuals, self._lowest.residuals)):
-                self._lowest = one
-        super().tell(observations)
+    def _improves(self, observation: Observation) -> bool:
+        """Tell whether an observation costs less than the lowest so far."""
+        lowest = None if self._lowest is None else self._lowest.residuals
+        return observation.residuals is not None and (
+            lowest is None or costs_less(observation.residuals, lowest))
 
-    def _plan(self) -> Plan:
+    def _batches(self) -> Batches:
         """Follow descents from the start points, lowest cost first, until the lowest minimum is confirmed."""
-        starts = self._by_cost((yield from self._starts()))
+        starts = yield from self._starts()
+        narrowest = min(Huber.of(start.residuals) for start in starts if start.residuals is not None)
+        starts.sort(key=lambda start: narrowest.cost(start.residuals))
         best = yield from self._descend(self._begin(starts.pop(0)), None, starts)
         beyond: list[Descent] = []
-        found, checks, looked = 1, 0, False  # times that the best minimum was reached; starts that checked it
-        while found < 2 and checks < 2 and not self._hints.refines:
-            starts = [one for one in starts if np.abs(one.point - best.point).max() > NEAR]
+        reached, checks, scanned = 1, 0, False  # descents that ended in the best minimum; that checked it
+        while reached < 2 and checks < 2 and not self._hints.refines:
+            starts = [start for start in starts if np.abs(start.point - best.point).max() > NEAR]
             if not best.ended and not best.has_rival(starts):
                 best = yield from self._descend(best, None, ())
             if best.ended:
                 self._to_lowest(best)
-                if not looked:
-                    beyond = yield from self._look_beyond(best)
-                    looked = True
+                if not scanned:
+                    beyond = yield from self._scan(best)
+                    scanned = True
             if not (beyond or starts):
                 break
             independent = not beyond
@@ -109,27 +100,43 @@ class LeastSquares(PlannedSearch):
             checks += independent and bool(best.ended)
             descent = yield from self._descend(begun, best, starts)
             same, better = self._same_minimum(descent, best), costs_less(descent.residuals, best.residuals)
-            found = found + independent if same else 1 if better else found
+            reached = reached + independent if same else 1 if better else reached
             if better:
                 best = descent
         if not best.ended:
             best = yield from self._descend(best, None, ())
-        if not looked and not self._hints.refines:
+        if not scanned and not self._hints.refines:
             self._to_lowest(best)
-            for begun in (yield from self._look_beyond(best)):
+            for begun in (yield from self._scan(best)):
                 descent = yield from self._descend(begun, best, ())
                 if costs_less(descent.residuals, best.residuals):
-                    best, found = descent, 1
+                    best, reached = descent, 1
             if not best.ended:
                 best = yield from self._descend(best, None, ())
         if self._hints.jacobian is None:
-            best = yield from self._polish(best)
-            self._descents.append(best)
-        return best.ended + (f'; reached from {found} starts' if found > 1 else '')
+            last = yield from self._finish(best)
+            best, reached = last, reached if self._same_minimum(last, best) else 1
+        return best.ended + (f'; reached from {reached} starts' if reached > 1 else '')
+
+    def _finish(self, best: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
+        """Polish a minimum; if that saves much, the descent had stalled in a rough valley, and goes on."""
+        for _ in range(MOST_RESUMED):
+            polished = yield from self._polish(best)
+            self._descents.append(polished)
+            stalled = polished.cost < (1 - STALLED) * polished.loss.cost(best.residuals)
+            best = polished
+            if not stalled:
+                break
+            best.ended = ''
+            best = yield from self._descend(best, None, ())
+        return best
 
     def _polish(self, here: Descent) -> Generator[Floats, Sequence[Observation], Descent]:
         """
         Improve a minimum with wide differences, which kinks of the residuals disturb less than narrow ones.
+
+        Steps along a single principal axis are tried, too, if they promise much: along a narrow valley, the
+        model is right for longer than across it.
 
         :returns: the improved descent, or `here` where no point costs clearly less.
         """
@@ -139,17 +146,15 @@ class LeastSquares(PlannedSearch):
                 break
             least = self._least_effect[columns].max(initial=0.0) / self._least_effect
             reach = np.clip(STEP * np.sqrt(least), STEP, 5 * STEP)
-            points = both_sides(here.point, columns, reach)
-            seen = yield points
-            wide = here.jacobian.copy()
-            for j, k in enumerate(columns):
-                two = seen[2 * j:2 * j + 2]
-                column = slope([one.point[k] for one in two], [one.residuals for one in two])
-                wide[:, k] = wide[:, k] if column is None else column
+            sides = Differences.central(here.point, columns, reach)
+            beside = yield sides.points
+            wide = sides.jacobian(here.jacobian, [observation.residuals for observation in beside])
             there = Descent(here.point, here.residuals, here.loss, wide, NEAR, origin=here.point)
             steps = [there.step(radius) for radius in (SCAN_RADIUS, NEAR, NEAR / 3)]
+            steps += [step for step in there.axis_steps(SCAN_RADIUS)
+                      if there.predicted(step) < (1 - STALLED) * there.cost]
             tried = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
-            best = min((*seen, *tried), key=lambda one: here.loss.cost(one.residuals))
+            best = min((*beside, *tried), key=lambda observation: here.loss.cost(observation.residuals))
             if here.loss.cost(best.residuals) >= (1 - 2e-3) * here.cost:
                 break  # a gain of less than 0.2 % is not worth another iteration
             here = replace(here, jacobian=wide, origin=here.point)
@@ -163,14 +168,14 @@ class LeastSquares(PlannedSearch):
         if self._hints.jacobian is not None and np.array_equal(start.point, np.clip(self._hints.start, 0, 1)):
             begun.jacobian, begun.moves = self._hints.jacobian, 1
             begun.origin = np.full(self._dimension, np.inf)  # not fresh, as it is not quite that of here
-            self._see_effects(begun)
+            self._note_effects(begun)
         return begun
 
-    def _look_beyond(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
+    def _scan(self, here: Descent) -> Generator[Floats, Sequence[Observation], list[Descent]]:
         """
-        Try points along the range of the parameter of least effect, where minima often lie side by side.
+        Scan the range of the parameter of least effect, along which minima often lie side by side.
 
-        :returns: a descent at the best of them, if its predicted cost is at least 2 % lower; else none.
+        :returns: a descent at the best scanned point, if its predicted cost is at least 2 % lower; else none.
         """
         free = np.flatnonzero(here.visible())
         if not len(free):
@@ -181,14 +186,15 @@ class LeastSquares(PlannedSearch):
         points = np.tile(here.point, (len(values), 1))
         points[:, weakest] = values
         observations = yield points
-        found = []
-        for one in observations:
-            if one.residuals is not None:
-                there = Descent(one.point, one.residuals, here.loss, here.jacobian, NEAR, origin=here.origin)
+        promising = []
+        for observation in observations:
+            if observation.residuals is not None:
+                there = Descent(observation.point, observation.residuals, here.loss, here.jacobian, NEAR,
+                                origin=here.origin)
                 predicted = there.predicted(there.step(SCAN_RADIUS))
-                found.append((min(predicted, there.cost), there))
-        found.sort(key=lambda pair: pair[0])
-        return [there for predicted, there in found[:1] if predicted < (1 - 0.02) * here.cost]
+                promising.append((min(predicted, there.cost), there))
+        promising.sort(key=lambda pair: pair[0])
+        return [there for predicted, there in promising[:1] if predicted < (1 - 0.02) * here.cost]
 
     def _starts(self) -> Generator[Floats, Sequence[Observation], list[Observation]]:
         """Ask for start points until at least one can be simulated."""
@@ -207,23 +213,17 @@ class LeastSquares(PlannedSearch):
             points[:, ~self._hints.excited] = np.where(np.isnan(hint), 0.5, hint)[~self._hints.excited]
             order = np.unique(points, axis=0, return_index=True)[1]
             observations = yield points[np.sort(order)]
-            starts = [one for one in observations if one.residuals is not None]
+            starts = [start for start in observations if start.residuals is not None]
             if starts:
                 return starts
 
     @staticmethod
-    def _by_cost(starts: Sequence[Observation]) -> list[Observation]:
-        """Sort start points by their cost, using the narrowest of their losses for all."""
-        loss = min(Huber.of(one.residuals) for one in starts if one.residuals is not None)
-        return sorted(starts, key=lambda one: loss.cost(one.residuals))
-
-    @staticmethod
-    def _same_minimum(one: Descent, other: Descent) -> bool:
+    def _same_minimum(descent: Descent, other: Descent) -> bool:
         """Tell whether two descents are near each other, or equal in cost within 0.1 %."""
-        loss = min(one.loss, other.loss)
-        costs = loss.cost(one.residuals), loss.cost(other.residuals)
-        both = one.visible() & other.visible()
-        apart = np.abs(one.point - other.point)[both].max(initial=0.0)
+        loss = min(descent.loss, other.loss)
+        costs = loss.cost(descent.residuals), loss.cost(other.residuals)
+        both = descent.visible() & other.visible()
+        apart = np.abs(descent.point - other.point)[both].max(initial=0.0)
         return bool(apart < NEAR or abs(costs[0] - costs[1]) <= 1e-3 * max(costs))
 
     def _to_lowest(self, descent: Descent) -> None:
@@ -240,7 +240,7 @@ class LeastSquares(PlannedSearch):
         It is given up where it leads to the `known` minimum or to a higher one, or where it is
         slow and one of the start points `rivals` is as promising.
         """
-        self._descents = [one for one in self._descents if one is not here] + [here]
+        self._descents = [descent for descent in self._descents if descent is not here] + [here]
         slow = 0
         if here.origin is None:
             yield from self._measure(here, np.flatnonzero(self._hints.excited))
@@ -297,7 +297,7 @@ class LeastSquares(PlannedSearch):
         if np.abs(steps[0] - shorter).max() > 0.1 * np.abs(steps[0]).max():
             steps.append(shorter)
         observations = yield np.clip([here.point + step for step in steps], 0.0, 1.0)
-        costs = [here.loss.cost(one.residuals) for one in observations]
+        costs = [here.loss.cost(observation.residuals) for observation in observations]
         gains = [here.cost - here.predicted(step) for step in steps]
         chosen = int(np.argmin(costs))
         base, before = here.point, here.residuals
@@ -313,46 +313,46 @@ class LeastSquares(PlannedSearch):
         else:
             here.radius = min(float(np.abs(step).max()) for step in steps) / 4
         # The longest step comes last: the updated Jacobian then predicts it exactly.
-        for one in sorted(observations, key=lambda seen: float(np.linalg.norm(seen.point - base))):
-            here.update_jacobian(one, base, before)
+        for observation in sorted(observations, key=lambda one: float(np.linalg.norm(one.point - base))):
+            here.update_jacobian(observation, base, before)
         here.moves += moved
         return moved
 
     def _measure(self, here: Descent, columns: NDArray[np.intp]
                  ) -> Generator[Floats, Sequence[Observation], None]:
-        """Measure columns of the Jacobian by finite differences; move to the best point if it costs less."""
+        """
+        Measure columns of the Jacobian by finite differences; move to the best point if it costs less.
+
+        Where a difference fails, the other side is tried.
+        """
         here.origin, here.moves = here.point, 0
-        here.jacobian = here.jacobian.copy()
         sizes = self._difference_steps(here)
-        seen = yield from self._differences(here, columns, sizes)
-        self._see_effects(here)
-        nearest = min(seen, key=lambda one: here.loss.cost(one.residuals), default=None)
-        if nearest is not None and here.loss.cost(nearest.residuals) < here.cost:
-            here.move(nearest)
-
-    def _see_effects(self, here: Descent) -> None:
-        effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
-        self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
-
-    def _differences(self, here: Descent, columns: NDArray[np.intp], sizes: Floats
-                     ) -> Generator[Floats, Sequence[Observation], list[Observation]]:
-        """Set columns of the Jacobian from steps of given sizes; where one fails, try the other side."""
-        seen: list[Observation] = []
+        beside: list[Observation] = []
+        jacobian = here.jacobian.copy()  # `model` uses that of `here` if the budget is spent meanwhile
+        jacobian[:, columns] = 0.0
         for _ in range(2):
             if not len(columns):
                 break
-            sizes = inward(here.point, sizes)
-            told = yield np.clip(here.point + np.diag(sizes)[columns], 0.0, 1.0)
-            for k, one in zip(columns, told, strict=True):
-                column = slope((here.point[k], one.point[k]), (here.residuals, one.residuals))
-                here.jacobian[:, k] = 0.0 if column is None else column
-            seen.extend(told)
-            columns = columns[[one.residuals is None for one in told]]
+            leaving = (here.point + sizes > 1) | (here.point + sizes < 0)
+            sizes = np.where(leaving, -sizes, sizes)
+            sides = Differences.one_sided(here.point, columns, sizes)
+            batch = yield sides.points
+            residuals = [observation.residuals for observation in batch]
+            here.jacobian = jacobian = sides.jacobian(jacobian, residuals, here.residuals)
+            beside.extend(batch)
+            columns = columns[[one is None for one in residuals]]
             sizes = -sizes / 2
-        return seen
+        self._note_effects(here)
+        best = min(beside, key=lambda observation: here.loss.cost(observation.residuals), default=None)
+        if best is not None and here.loss.cost(best.residuals) < here.cost:
+            here.move(best)
+
+    def _note_effects(self, here: Descent) -> None:
+        effect = np.sqrt(np.mean(here.jacobian ** 2, axis=0))
+        self._least_effect = np.where(effect > 0, np.minimum(self._least_effect, effect), self._least_effect)
 
     def _difference_steps(self, here: Descent) -> Floats:
-        """Return (d,) steps of finite differences that change the residuals well beyond their roughness."""
+        """Return (d,) steps of finite differences that change the residuals far beyond their roughness."""
         if not here.jacobian.any() or self._hints.jacobian is not None:
             return np.full(self._dimension, FIRST_STEP)
         most = here.loss.threshold

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search: a method that asks for points of the unit cube and is told their observations."""
+"""Search: a method that asks for points of the unit cube and receives their observations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Sequence
+from typing import Generator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,30 +64,68 @@ class Hints:
         return cls(start, np.ones(len(start), np.bool_), True, jacobian, coarse)
 
 
-class Search(Protocol):
-    """A minimiser over the unit cube.  It never sees a trial or a physical unit."""
+#: It yields (m, d) points, receives their m observations, and returns why it finished, in words.
+Batches = Generator[Floats, Sequence[Observation], str]
+
+
+class Search:
+    """
+    A minimiser over the unit cube; it never sees a trial or a physical unit.
+
+    A method derives from it, and yields batches of points in `_batches`.  A batch may be asked in portions of
+    any size: the points depend neither on the portions nor on the number of workers.
+
+    :param dimension: number of parameters.
+    :param seed: of the method's random numbers.
+    :param hints: what is known before the first evaluation; None: nothing.
+    """
 
     name: str
 
-    def ask(self, limit: int) -> Floats:
-        """
-        Return the next (m, d) points to evaluate, m <= limit.
+    def __init__(self, dimension: int, seed: int, hints: Hints | None = None) -> None:
+        self._dimension, self._seed = dimension, seed
+        self._hints = Hints.none(dimension) if hints is None else hints
+        self._lowest: Observation | None = None
+        self._under_way: Batches | None = None
+        self._batch: Floats = np.zeros((0, dimension))
+        self._observations: list[Observation] = []  # of the first points of the batch
+        self.stop_reason = ''  # why the method ended, in words; empty until then
 
-        The method chooses m, whatever the number of workers.  No points at all
-        mean that it has finished.
-        """
+    def _batches(self) -> Batches:
+        raise NotImplementedError
+
+    def _improves(self, observation: Observation) -> bool:
+        """Tell whether an observation is better than the best so far: by default, its score is lower."""
+        return bool(np.isfinite(observation.score)) and (
+            self._lowest is None or observation.score < self._lowest.score)
+
+    def ask(self, limit: int) -> Floats:
+        """Return the next (m, d) points, m <= limit; none once the method has ended."""
+        if self._under_way is None:
+            self._under_way = self._batches()
+            self._batch = np.asarray(next(self._under_way), dtype=float)
+        return self._batch[len(self._observations):][:limit].copy()
 
     def tell(self, observations: Sequence[Observation]) -> None:
-        """Take the results of the last `ask`, in the order asked."""
-
-    @property
-    def stop_reason(self) -> str:
-        """Why it finished, in words; empty until then."""
+        """Take the results of the last `ask`, in the order asked; go on once the batch is complete."""
+        for observation in observations:
+            if self._improves(observation):
+                self._lowest = observation
+        self._observations.extend(observations)
+        if self._under_way is None or self.stop_reason or len(self._observations) < len(self._batch):
+            return
+        complete, self._observations = self._observations, []
+        try:
+            self._batch = np.asarray(self._under_way.send(complete), dtype=float)
+        except StopIteration as end:
+            self._batch, self.stop_reason = np.zeros((0, self._dimension)), str(end.value)
 
     @property
     def best(self) -> Floats | None:
         """The (d,) point that is the result of the method; None until an evaluation has succeeded."""
+        return None if self._lowest is None else self._lowest.point
 
     @property
     def model(self) -> Linearisation | None:
-        """Linear model of the residuals at `best`; None where the method has not made one."""
+        """Linear model of the residuals at `best`; None if the method has not made one."""
+        return None

@@ -1,54 +1,174 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The compiled engine: rollouts in the core, with its own contact with a table."""
+"""CompiledSimulator: rollouts in the core; Engine: what it shares with the engine in PyBullet."""
 
 from __future__ import annotations
 
-from typing import Mapping, Sequence
+import copy
+from dataclasses import dataclass
+import threading
+from typing import Any, Mapping, Self, Sequence
 
 from dlo_calibration.errors import SimulationError
+from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.table import resting_level
 from dlo_calibration.simulation import core
-from dlo_calibration.simulation.core import Stop
-from dlo_calibration.simulation.engine import Engine, Prepared
-from dlo_calibration.simulation.protocol import Job, Rollout, simulate_one
+from dlo_calibration.simulation.nodes import NodeLayout
+from dlo_calibration.simulation.protocol import (
+    DEFAULT_NODES,
+    DEFAULT_TIME_STEP,
+    Job,
+    Rollout,
+    TogetherSimulator,
+)
+from dlo_calibration.simulation.script import Script, Settling
+
+MOST_KNOWN = 1000  # trials that are kept; a plan simulates each of its trials only once
+MOST_POSITIONS = 200_000  # of hands in the scripts that are kept: 100 MB if each hand holds four nodes
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """
+    What of a trial does not depend on the parameters.
+
+    :param level: height [m] of nodes on the table; None if it is unknown, or if there is no table.
+    :param start: of the nodes; where their height on the table is unknown, as they were observed.
+    """
+
+    trial: Trial
+    layout: NodeLayout
+    level: float | None
+    start: core.Start
+    script: Script
+
+
+class Engine:
+    """
+    Simulates trials on a table or in the air.
+
+    The table is placed so that the rope rests on it at the measured height for every
+    evaluated radius: no radius throws the rope up or lets it fall.  Threads may share an engine.
+
+    :param table: whether there is a table.
+    :param table_height: height of the table [m].
+    :param nodes: number of nodes of the rope.
+    :param time_step: [s].
+    :param stable_distance: see `Settling` [m].
+    :param stable_time: see `Settling` [s].
+    :param settle_limit: see `Settling` [s].
+    """
+
+    name: str
+
+    def __init__(self, table: bool = True, table_height: float = 0.0, nodes: int = DEFAULT_NODES,
+                 time_step: float = DEFAULT_TIME_STEP, stable_distance: float = Settling.distance,
+                 stable_time: float = Settling.time, settle_limit: float = Settling.limit) -> None:
+        self._table_height = table_height if table else None
+        self._nodes = nodes
+        self._time_step = time_step
+        self._settling = Settling(stable_distance, stable_time, settle_limit)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._prepared: dict[int, Prepared] = {}  # by the identities of the trials
+        self._lock = threading.Lock()  # guards them
+
+    def _prepare(self, trial: Trial,
+                 physical: Mapping[str, float]) -> tuple[Prepared, core.Start, float | None]:
+        """
+        Return what is known of a trial, where its nodes start, and their height [m] on the table, or None.
+
+        :raises SimulationError: if a hand moves for too long.
+        :raises InputError: if the trial grips more points than there are nodes.
+        """
+        with self._lock:
+            known = self._prepared.get(id(trial))
+            if known is None or known.trial is not trial:
+                level = None if self._table_height is None else resting_level(trial, self._table_height)
+                layout = NodeLayout.of(trial, self._nodes)
+                script = Script.of(trial, layout, self._time_step, self._settling)
+                known = Prepared(trial, layout, level, layout.start(level), script)
+                self._keep(known)
+        if self._table_height is None or known.level is not None:
+            return known, known.start, known.level
+        level = self._table_height + physical['self_collision']
+        return known, known.layout.start(level), level
+
+    def _keep(self, known: Prepared) -> None:
+        """Keep a prepared trial; drop the oldest ones if they are too many or too large."""
+        trials, positions = self._prepared, known.script.positions
+        trials.pop(id(known.trial), None)
+        if positions > MOST_POSITIONS:
+            return
+        while len(trials) >= MOST_KNOWN or (
+                positions + sum(trial.script.positions for trial in trials.values()) > MOST_POSITIONS):
+            del trials[next(iter(trials))]
+        trials[id(known.trial)] = known
+
+    def _rollout(self, known: Prepared, outcome: tuple[Floats, tuple[bool, ...], int] | None) -> Rollout:
+        """
+        Return a rollout for an outcome of the core.
+
+        :raises SimulationError: if it diverged.
+        """
+        if outcome is None:
+            raise SimulationError('the rollout diverged: the chain is no longer finite')
+        nodes, settled, steps = outcome
+        return Rollout(known.layout.observe @ nodes, settled, steps * self._time_step, steps)
+
+    def refined(self) -> Self:
+        """Return an engine with twice the segments and half the time step."""
+        finer = copy.copy(self)
+        finer._nodes, finer._time_step = 2 * self._nodes - 1, self._time_step / 2
+        return finer
+
+    def close(self) -> None:
+        """Drop what is known of the trials."""
+        self._prepared.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what belongs to this process, and to this engine alone."""
+        return {name: value for name, value in self.__dict__.items() if name not in ('_prepared', '_lock')}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._begin()
+
 
 NO_TABLE = -1e6  # m; a table so low that no node touches it
 
 
-class CompiledSimulator(Engine):
-    """Simulates trials on a table or in the air, about 60 times as fast as `bullet.BulletSimulator`."""
+class CompiledSimulator(Engine, TogetherSimulator):
+    """
+    Simulates trials on a table or in the air, about 60 times as fast as `bullet.BulletSimulator`.
+
+    A trial that grips more points than there are nodes is refused with an InputError.
+    """
 
     name = 'compiled'
     at_a_time = 48  # twelve for each lane, of which some are empty only towards the end
 
-    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
-        """
-        Simulate a trial with physical parameters by name (SI units).
-
-        :raises SimulationError: if the rollout diverges.
-        :raises InputError: if the trial grips more points than there are nodes.
-        """
-        return simulate_one(self, (trial, physical))
-
-    def simulate_together(self, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
+    def simulate_together(self, jobs: Sequence[Job], stop: core.Stop) -> list[Rollout | SimulationError]:
         """Simulate each job, four at a time; see `TogetherSimulator`."""
-        found: list[Rollout | SimulationError] = []
-        known: list[Prepared | SimulationError] = []
+        rollouts: list[Rollout | SimulationError] = []
+        prepared: list[Prepared | SimulationError] = []
         packed = []
         for trial, physical in jobs:
             try:
-                prepared, start, level = self._prepare(trial, physical)
+                known, start, level = self._prepare(trial, physical)
             except SimulationError as error:
-                known.append(error)
+                prepared.append(error)
             else:
-                known.append(prepared)
-                packed.append((prepared.script.events, start, physical, NO_TABLE if level is None else level))
+                prepared.append(known)
+                packed.append((known.script.events, start, physical, NO_TABLE if level is None else level))
         outcomes = iter(core.roll_out(packed, self._time_step, stop))
-        for one in known:
+        for job in prepared:
             try:
-                found.append(one if isinstance(one, SimulationError) else self._rollout(one, next(outcomes)))
+                rollouts.append(job if isinstance(job, SimulationError) else
+                                self._rollout(job, next(outcomes)))
             except SimulationError as error:
-                found.append(error)
-        return found
+                rollouts.append(error)
+        return rollouts

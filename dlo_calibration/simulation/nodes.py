@@ -16,7 +16,7 @@ from dlo_calibration.errors import InputError
 from dlo_calibration.model.action import Hand
 from dlo_calibration.model.chain import Chain, Floats, frozen_array, grip_place, interpolation_matrix
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.observation.clamps import clamp_directions
+from dlo_calibration.observation.material import clamp_directions
 from dlo_calibration.observation.noise import NO_NOISE, noise, noise_of, smooth
 from dlo_calibration.observation.table import rest_on
 from dlo_calibration.simulation import core

@@ -92,17 +92,12 @@ class TogetherSimulator(Protocol):
         :returns: the rollouts, or why they failed, in order.
         """
 
-
-def simulate_one(simulator: TogetherSimulator, job: Job) -> Rollout:
-    """
-    Return the rollout of one job by a simulator that takes several.
-
-    :raises SimulationError: if it failed.
-    """
-    found, = simulator.simulate_together([job], Stop())
-    if isinstance(found, SimulationError):
-        raise found
-    return found
+    def simulate(self, trial: Trial, physical: Mapping[str, float]) -> Rollout:
+        """Simulate a single trial; see `Simulator`."""
+        outcome, = self.simulate_together([(trial, physical)], Stop())
+        if isinstance(outcome, SimulationError):
+            raise outcome
+        return outcome
 
 
 def simulate_all(simulator: Simulator, jobs: Sequence[Job], stop: Stop) -> list[Rollout | SimulationError]:
@@ -112,16 +107,16 @@ def simulate_all(simulator: Simulator, jobs: Sequence[Job], stop: Stop) -> list[
     :raises CancelledError: once `stop` is set.
     """
     if isinstance(simulator, TogetherSimulator) and not stop.is_set():
-        found = simulator.simulate_together(jobs, stop)
+        outcomes = simulator.simulate_together(jobs, stop)
     else:
-        found = []
+        outcomes = []
         for trial, physical in jobs:
             if stop.is_set():
                 break
             try:
-                found.append(simulator.simulate(trial, physical))
+                outcomes.append(simulator.simulate(trial, physical))
             except SimulationError as error:
-                found.append(error)
+                outcomes.append(error)
     if stop.is_set():
         raise CancelledError
-    return found
+    return outcomes

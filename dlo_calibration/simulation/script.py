@@ -108,7 +108,7 @@ class _Writer:
 
     def write(self) -> None:
         """Go up to each goal in turn."""
-        seen = 0  # goals that have been
+        seen = 0  # number of goals so far
         for k, goal in enumerate(self._trial.goals):
             self._goal = k
             if goal.stable:
@@ -121,7 +121,7 @@ class _Writer:
                 seen = self._trace(k + 1)
 
     def _goals(self, first: int) -> Iterator[Goal]:
-        """Yield the goals from an index on, without a copy: a stream has thousands."""
+        """Yield the goals from an index on; no copy, because a stream has thousands."""
         for k in range(first, len(self._trial.goals)):
             yield self._trial.goals[k]
 
@@ -226,7 +226,7 @@ class _Writer:
                 self._release(closed)
 
     def _let_go(self, nodes: tuple[int, ...]) -> None:
-        """Take nodes from the hands that hold them, because another hand grips them."""
+        """Release nodes that another hand grips from the hands that hold them."""
         for name, closed in list(self._closed.items()):
             kept = [k for k, node in enumerate(closed.nodes) if node not in nodes]
             if not kept:
@@ -264,10 +264,10 @@ class _Writer:
 
 
 def _rows(array: Floats, first: int, count: int) -> Floats:
-    """Return so many rows of an array; where there are no more, the last one again."""
-    found = array[first:first + count]
-    rest = count - len(found)
-    return np.concatenate([found, np.repeat(array[-1:], rest, axis=0)]) if rest else found
+    """Return `count` rows of an array from `first` on; beyond its end, repeat the last one."""
+    rows = array[first:first + count]
+    rest = count - len(rows)
+    return np.concatenate([rows, np.repeat(array[-1:], rest, axis=0)]) if rest else rows
 
 
 def _hand_steps(hand: Hand, start: float, step: float, count: int) -> tuple[Floats, Floats | None, Floats]:

@@ -22,10 +22,9 @@ import numpy as np
 from dlo_calibration.errors import DloCalibrationError
 from dlo_calibration.model.chain import Floats, interpolation_matrix
 from dlo_calibration.model.trial import Trial
-from dlo_calibration.simulation.bullet import IDENTITY
-from dlo_calibration.simulation.bullet_world import add_obstacle, pybullet
+from dlo_calibration.simulation.bullet import add_obstacle, IDENTITY, pybullet
 from dlo_calibration.simulation.motion import hands_at, Motion
-from dlo_calibration.simulation.obstacles import read_scene
+from dlo_calibration.simulation.scene import read_scene
 
 FRAME_RATE = 30  # 1/s
 MOST_FRAMES = 3000  # of one motion: a longer one has fewer frames a second
@@ -33,7 +32,7 @@ PAUSE = 1.0  # s from the end of a motion to the start of the next
 MOST_BEADS = 300  # spheres that the DLO is drawn with
 HAND = 0.008  # m, half the edge of the cube that stands for a hand
 ROPE_COLOUR, TABLE_COLOUR, OPEN = (0.84, 0.37, 0.0, 1.0), (0.93, 0.93, 0.9, 1.0), 0.35
-Colour = tuple[float, float, float]
+Colour = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,8 @@ class Film:
         weights = interpolation_matrix(places, np.linspace(0.0, places[-1], count))
         states = [hands_at(trial, float(time)) for time in motion.times]
         return cls(name, motion.times, weights @ motion.chains, tuple(
-            (_numbers(colours[hand]), np.array([state[hand][0] for state in states]),
+            (tuple(channel / 255 for channel in bytes.fromhex(colours[hand][1:])),
+             np.array([state[hand][0] for state in states]),
              tuple(state[hand][1] for state in states)) for hand in states[0]))
 
 
@@ -91,7 +91,7 @@ def show(films: Sequence[Film], radius: float, table: float | None, scene: str =
             here.recv()
         except EOFError as error:
             raise DloCalibrationError(
-                "PyBullet's window: got no screen that it can open a window on, expected one with OpenGL; "
+                "PyBullet's window: no screen that it can open a window on; expected one with OpenGL; "
                 'start the command on a desktop, or write an animation with --output') from error
         on_open()
         process.join()
@@ -124,11 +124,12 @@ def _show(parent: Connection, films: Sequence[Film], radius: float, table: float
 
 
 class _Stage:
-    """The bodies in the window, enough for any of the films; making and removing a body takes a frame."""
+    """The bodies in the window, enough for every film: adding or removing a body takes a frame."""
 
     def __init__(self, client: int, films: Sequence[Film], radius: float, table: float | None) -> None:
         self._client = client
-        low, high = _ends(films)
+        points = np.concatenate([film.beads.reshape(-1, 3) for film in films])
+        low, high = points.min(axis=0), points.max(axis=0)
         self._extent = max(0.1, float((high - low).max()))
         self._place = np.array([*(low + high)[:2] / 2, low[2] if table is None else table])
         # While nothing is drawn, bodies are made much faster.
@@ -149,13 +150,13 @@ class _Stage:
 
     def _bodies(self, places: Sequence[Floats] | Floats, colour: Sequence[float], kind: int,
                 **sizes: object) -> Sequence[int]:
-        """Add bodies of one shape that only are seen; return their ids."""
+        """Add bodies of one shape that are drawn and never collide; return their ids."""
         shape = pybullet.createVisualShape(kind, rgbaColor=list(colour), physicsClientId=self._client,
                                            **sizes)
-        found: Sequence[int] = pybullet.createMultiBody(
+        bodies: Sequence[int] = pybullet.createMultiBody(
             0, baseVisualShapeIndex=shape, batchPositions=np.asarray(places).tolist(),
             physicsClientId=self._client)
-        return found
+        return bodies
 
     def show(self, film: Film, clock: Callable[[], float], sleep: Callable[[float], None],
              should_stop: Callable[[], bool]) -> bool:
@@ -191,14 +192,3 @@ class _Stage:
 
     def _move(self, body: int, place: Sequence[float]) -> None:
         pybullet.resetBasePositionAndOrientation(body, place, IDENTITY, physicsClientId=self._client)
-
-
-def _ends(films: Sequence[Film]) -> tuple[Floats, Floats]:
-    """Return the lowest and highest coordinates (3,) [m] of all beads."""
-    points = np.concatenate([film.beads.reshape(-1, 3) for film in films])
-    return points.min(axis=0), points.max(axis=0)
-
-
-def _numbers(colour: str) -> Colour:
-    red, green, blue = (int(colour[k:k + 2], 16) / 255 for k in (1, 3, 5))
-    return red, green, blue

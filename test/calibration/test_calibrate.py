@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
 from toy_simulator import new_toy, toy_trial, ToySimulator
@@ -122,7 +122,7 @@ def test_the_budget_is_spent_and_not_more(budget):
     assert result.stop_reason == f'budget of {budget} evaluations spent'
 
 
-def test_the_record_says_how_it_was_found():
+def test_the_result_names_search_engine_seed_and_stop_reason():
     ticks = iter([10.0, 17.5])
     options = Options(search='random', evaluations=3, seed=7, workers=1, engine='compiled')
     result = calibrate(TRIALS, options, make_simulator=new_toy, clock=lambda: next(ticks))
@@ -131,7 +131,7 @@ def test_the_record_says_how_it_was_found():
     assert result.warnings == ()
 
 
-def test_a_search_that_finishes_early_says_why():
+def test_a_search_that_ends_early_says_why():
     class Finished:
         name = 'finished'
         limit = float('inf')
@@ -164,7 +164,7 @@ def test_a_stop_gives_the_best_so_far():
     assert result.evaluations[-1].scores == found(budget=5).evaluations[-1].scores
 
 
-def test_a_stop_before_anything_is_known_is_no_result():
+def test_a_stop_before_the_first_evaluation_gives_no_result():
     with pytest.raises(SimulationError, match='stopped before the first evaluation had finished'):
         found(should_stop=lambda: True)
     with ThreadPoolExecutor(2) as executor, pytest.raises(SimulationError, match='stopped before the first'):
@@ -187,7 +187,7 @@ def test_failed_evaluations_are_kept_with_their_reason():
         f'{len(failed)} of 60 evaluations could not be simulated: trial 1: diverged',)
 
 
-def test_where_all_fail_there_is_no_result_but_a_reason():
+def test_no_result_but_a_reason_if_all_evaluations_fail():
     with pytest.raises(SimulationError, match='none of 12 evaluations could be simulated: trial 1: diverged'):
         found(simulator=ToySimulator(fail_below=101.0), budget=12)
 
@@ -228,7 +228,7 @@ def test_a_rollout_that_is_not_finite_is_a_failure_and_never_wins():
     assert [bool(evaluation.failure) for evaluation in result.evaluations] == [True] * 2 + [False] * 8
 
 
-def test_an_error_that_nobody_expects_is_not_hidden():
+def test_an_unexpected_error_is_raised():
     with pytest.raises(RuntimeError, match='the toy'):
         found(simulator=ToySimulator(crash=True))
     with ThreadPoolExecutor(2) as executor, pytest.raises(RuntimeError, match='the toy'):
@@ -236,7 +236,7 @@ def test_an_error_that_nobody_expects_is_not_hidden():
 
 
 def test_without_trials_there_is_nothing_to_calibrate():
-    with pytest.raises(InputError, match='no trials, expected at least one complete trial; record'):
+    with pytest.raises(InputError, match='no trials; expected at least one complete trial; record'):
         calibrate(())
 
 
@@ -271,7 +271,7 @@ def test_any_number_of_threads_gives_the_same_result_bit_for_bit(threads):
     assert found(seed=2, budget=80).best.scores != here.best.scores
 
 
-def test_a_stop_elsewhere_gives_the_first_evaluations_in_order():
+def test_a_stop_from_another_thread_gives_the_first_evaluations_in_order():
     seen = []
     with ThreadPoolExecutor(2) as executor:
         result = found(executor=executor, on_evaluation=seen.append, should_stop=lambda: len(seen) >= 10)

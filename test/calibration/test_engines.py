@@ -13,7 +13,7 @@ from toy_messages import toy_trials
 from dlo_calibration import calibrate
 from dlo_calibration.calibration import engines
 from dlo_calibration.calibration.engines import ENGINES, make_simulator
-from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation import ProcessSimulator
 from dlo_calibration.model.parameters import ParameterSpace
@@ -37,13 +37,13 @@ def scene(tmp_path):
     return str(tmp_path / 'box.urdf')
 
 
-def test_what_can_be_chosen_can_be_made():
-    engine, = (one for one in declarations() if one.name == 'engine')
+def test_every_engine_that_can_be_chosen_can_be_made():
+    engine, = (one for one in Options.declarations() if one.name == 'engine')
     assert set(ENGINES) == set(engine.choices)
     assert Options().engine == 'auto'
 
 
-def test_auto_is_the_compiled_engine_and_tells_nothing(notices):
+def test_auto_is_the_compiled_engine_without_a_warning(notices):
     for engine in ('auto', 'compiled'):
         assert make_simulator(Options(engine=engine)).name == 'compiled'
     assert notices() == []
@@ -71,7 +71,7 @@ def test_an_engine_that_was_sent_to_another_process_is_the_same_there(finer):
 def test_the_compiled_engine_refuses_a_scene_by_name(scene):
     with pytest.raises(InputError) as refusal:
         make_simulator(Options(engine='compiled', scene=scene))
-    assert str(refusal.value) == (f'engine compiled: got scene {scene}, expected no scene: it simulates only '
+    assert str(refusal.value) == (f'engine compiled: scene {scene}; expected no scene: it simulates only '
                                   'a table; use engine bullet or auto')
 
 
@@ -87,7 +87,7 @@ def test_auto_simulates_a_scene_with_bullet_and_says_so_once(scene, notices):
 @pytest.mark.parametrize('engine', ['auto', 'bullet'])
 def test_a_scene_that_is_not_there_is_refused_before_anything_is_simulated(engine):
     options = Options(engine=engine, scene='nowhere.urdf', workers=1)
-    with pytest.raises(InputError, match='scene nowhere.urdf: got .*No such file.*expected a URDF file'):
+    with pytest.raises(InputError, match='scene nowhere.urdf: .*No such file.*expected a URDF file'):
         calibrate(toy_trials(1), options, make_simulator=make_simulator)
 
 
@@ -108,7 +108,7 @@ def test_without_pybullet_its_engine_and_scenes_are_refused_in_a_sentence(withou
                            (Options(scene=scene), f'scene {scene}')):
         with pytest.raises(InputError) as refusal:
             calibrate(toy_trials(1), options)
-        assert str(refusal.value) == (f'{thing}: got no PyBullet, expected that library; '
+        assert str(refusal.value) == (f'{thing}: no PyBullet; expected that library; '
                                       'install it: pip install pybullet')
 
 

@@ -12,7 +12,7 @@ from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Action, Chain, Goal, Hand, Options, Trial
 from dlo_calibration.calibration.calibrate import calibrate
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 from dlo_calibration.simulation.compiled import CompiledSimulator
 

@@ -5,13 +5,14 @@
 
 from dataclasses import replace
 
-from mortal import Mortal
 import pytest
 from toy_messages import toy_trials
+from toy_simulator import CountingToy
 
 from dlo_calibration import calibrate, EvaluationLog, Options
-from dlo_calibration.calibration.identity import calibration_digest, engine_digest
-from dlo_calibration.calibration.plain import evaluation_rows, plain
+from dlo_calibration.calibration.engines import engine_digest
+from dlo_calibration.calibration.result import evaluation_rows, plain
+from dlo_calibration.workspace.folder import calibration_digest
 
 CHOICES = {
     'least squares': {'evaluations': 40},
@@ -38,7 +39,7 @@ class Engines:
 
     def __call__(self, options):
         name = 'toy' if options.engine == 'auto' else 'bullet'
-        self.made.append(Mortal(name, self.last, die, self.counted))
+        self.made.append(CountingToy(name, self.last, die, self.counted))
         return self.made[-1]
 
     @property
@@ -46,7 +47,7 @@ class Engines:
         return len(self.counted)
 
 
-def told(result):
+def outcome(result):
     """Return all that a result tells, without the time that it took."""
     return repr({**plain(result), 'seconds': 0}), repr(evaluation_rows(result))
 
@@ -68,7 +69,7 @@ def trials_of(name):
 def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
     """It is killed in the search, in the examination, while it advises and while another engine confirms."""
     options, trials, whole = options_of(name), trials_of(name), Engines()
-    expected = told(calibrate(trials, options, make_simulator=whole))
+    expected = outcome(calibrate(trials, options, make_simulator=whole))
     assert len(whole.made) == 2
     path = tmp_path / 'log'
     simulated, kills = 0, 0
@@ -81,7 +82,7 @@ def test_nothing_is_simulated_twice_and_the_result_is_the_same(name, tmp_path):
         except Killed:
             simulated += engines.count
             kills += 1
-    assert told(result) == expected
+    assert outcome(result) == expected
     assert kills >= 4
     # Each kill costs at most the trials of the evaluation under way.
     assert simulated + engines.count <= whole.count + kills * (len(trials) - 1)
@@ -92,12 +93,12 @@ def unkilled(tmp_path_factory):
     """Return what a calibration tells that nobody kills, and how many rollouts it needs."""
     options, whole = options_of('least squares'), Engines()
     with EvaluationLog(tmp_path_factory.mktemp('whole') / 'log') as log:
-        return told(calibrate(toy_trials(2), options, make_simulator=whole, log=log)), whole.count
+        return outcome(calibrate(toy_trials(2), options, make_simulator=whole, log=log)), whole.count
 
 
 @pytest.mark.parametrize('left', [
     *range(1, 60, 14), *(pytest.param(left, marks=pytest.mark.long) for left in range(8, 60, 14))])
-def test_what_comes_after_the_search_is_not_simulated_twice_either(left, unkilled, tmp_path):
+def test_later_stages_simulate_nothing_twice_either(left, unkilled, tmp_path):
     """Advice, missing parameters and confirmation are rollouts: each counts."""
     options, trials = options_of('least squares'), toy_trials(2)
     expected, count = unkilled
@@ -105,7 +106,7 @@ def test_what_comes_after_the_search_is_not_simulated_twice_either(left, unkille
         with pytest.raises(Killed):
             calibrate(trials, options, make_simulator=Engines(last=count - left + 1), log=log)
         engines = Engines()
-        assert told(calibrate(trials, options, make_simulator=engines, log=log)) == expected
+        assert outcome(calibrate(trials, options, make_simulator=engines, log=log)) == expected
     assert left <= engines.count <= left + (len(trials) - 1)  # one evaluation in the examination
 
 
@@ -118,7 +119,7 @@ def test_it_goes_on_with_another_number_of_threads(first, then, tmp_path):
         if len(seen) == 20:
             raise Killed
 
-    expected = told(calibrate(trials, options_of('random'), make_simulator=Engines()))
+    expected = outcome(calibrate(trials, options_of('random'), make_simulator=Engines()))
     with EvaluationLog(tmp_path / 'log') as log:
         with pytest.raises(Killed):
             calibrate(trials, options_of('random', first), make_simulator=Engines(), log=log,
@@ -127,13 +128,13 @@ def test_it_goes_on_with_another_number_of_threads(first, then, tmp_path):
         engines, again = Engines(), []
         result = calibrate(trials, options_of('random', then), make_simulator=engines, log=log,
                            on_evaluation=again.append)
-    assert told(result) == expected
+    assert outcome(result) == expected
     assert [one.index for one in again] == list(range(20))
 
 
 def test_a_stopped_calibration_stays_stopped_and_goes_on_when_asked(tmp_path):
     trials, options = toy_trials(2), options_of('random')
-    expected = told(calibrate(trials, options, make_simulator=Engines()))
+    expected = outcome(calibrate(trials, options, make_simulator=Engines()))
     seen = []
     with EvaluationLog(tmp_path / 'log') as log:
         for count in (5, 9):
@@ -141,7 +142,7 @@ def test_a_stopped_calibration_stays_stopped_and_goes_on_when_asked(tmp_path):
             result = calibrate(trials, options, make_simulator=Engines(), log=log, on_evaluation=seen.append,
                                should_stop=lambda count=count: len(seen) >= count)
             assert (len(result.evaluations), result.stop_reason) == (count, 'stopped on request')
-        assert told(calibrate(trials, options, make_simulator=Engines(), log=log)) == expected
+        assert outcome(calibrate(trials, options, make_simulator=Engines(), log=log)) == expected
 
 
 def test_the_digest_leaves_out_the_machine_and_the_place_of_the_scene(tmp_path):

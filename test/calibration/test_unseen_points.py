@@ -6,7 +6,7 @@
 from contextlib import closing
 from dataclasses import replace
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator

@@ -9,7 +9,7 @@ import json
 import pytest
 
 from dlo_calibration.capture.document import Document, PhotographEntry
-from dlo_calibration.capture.steps import described, KINDS
+from dlo_calibration.capture.hands import described, KINDS
 from dlo_calibration.errors import InputError
 
 A, B, C = 'aaaaaaaa', 'bbbbbbb2', 'ccccccc3'

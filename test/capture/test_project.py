@@ -5,6 +5,7 @@
 
 import io
 import json
+import os
 
 import numpy as np
 from PIL import Image
@@ -57,7 +58,7 @@ def test_what_was_done_is_there_when_the_folder_is_opened_again(project):
     np.testing.assert_array_equal(opened.photograph(two).pixels, project.photograph(two).pixels)
     assert (opened.path(one).suffix, opened.path(two).suffix) == ('.jpg', '.png')
     assert opened.lens.size == (200, 150)
-    assert opened.problems == ()
+    assert opened.problems == []
     opened.remove_lens()
     assert again(opened).lens is None
 
@@ -126,6 +127,23 @@ def test_a_link_in_place_of_a_photograph_is_not_followed(project, tmp_path):
         project.photograph('aaaaaaaa')
 
 
+@pytest.mark.parametrize('make', [
+    lambda path, elsewhere: os.mkfifo(path), lambda path, elsewhere: path.symlink_to(elsewhere),
+], ids=['FIFO', 'link'])
+@pytest.mark.parametrize('name', [
+    '.lock', 'project.json', 'lens.yaml', 'photographs', 'photographs/aaaaaaaa.png', 'session.mcap',
+    'request.xml', 'result', 'result/result.json', 'result/unfinished', 'result/unfinished/evaluations.log'])
+def test_a_folder_with_a_link_or_a_fifo_is_not_opened(tmp_path, name, make):
+    (tmp_path / 'elsewhere').mkdir()
+    path = tmp_path / 'rope' / name
+    path.parent.mkdir(parents=True)
+    make(path, tmp_path / 'elsewhere')
+    with pytest.raises(InputError) as refusal:
+        Project(tmp_path / 'rope')
+    assert str(refusal.value).startswith(str(path))
+    assert list((tmp_path / 'elsewhere').iterdir()) == []
+
+
 def test_a_bad_lens_leaves_the_good_one(project):
     project.set_lens(LENS.encode(), 'good.yaml')
     for octets in (b'no: lens', b'x' * (2**20 + 1), b'\xff\xfe'):
@@ -150,7 +168,7 @@ def test_a_damaged_document_is_kept_aside_and_told(project, octets):
     assert 'project_damaged_1.json' in opened.problems[0]
     assert (project.folder / 'project_damaged_1.json').read_bytes() == octets
     opened.add_photograph(picture(), 'new.png')
-    assert again(opened).problems == ()
+    assert again(opened).problems == []
 
 
 def test_a_folder_is_open_in_one_process_only(project):

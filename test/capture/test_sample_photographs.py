@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from photographed_trials import interpreted
+from photographed_trials import drafted
 import pytest
 
 from dlo_calibration import calibrate, Options
@@ -19,7 +19,7 @@ TRUTH = json.loads((SAMPLE / 'truth.json').read_text(encoding='utf-8'))
 
 
 @pytest.fixture(scope='module')
-def interpretation(tmp_path_factory):
+def drafts(tmp_path_factory):
     """Return what the capture page makes of the sample, and the ids of the photographs."""
     photographs = {name: ((SAMPLE / name).read_bytes(), clicks) for name, clicks in CLICKS.items()}
     opened = [trial['hand'][-1][:2] for trial in TRUTH['trials']]  # at the stickers
@@ -27,12 +27,12 @@ def interpretation(tmp_path_factory):
                   {'kind': 'drag', 'fraction': 0.4, 'to': opened[0]}]},
               {'start': 'second.jpg', 'goal': 'third.jpg', 'steps': [
                   {'kind': 'grasp_and_place', 'fraction': 1.0, 'height': 0.1, 'to': opened[1]}]}]
-    return interpreted(tmp_path_factory.mktemp('sample') / 'project', photographs, trials,
+    return drafted(tmp_path_factory.mktemp('sample') / 'project', photographs, trials,
                        {'mass': TRUTH['mass_kg']})
 
 
-def test_chains_of_the_sample_are_those_of_the_simulated_rope(interpretation):
-    trials = interpretation[0].usable
+def test_chains_of_the_sample_are_those_of_the_simulated_rope(drafts):
+    trials = drafts[0].complete
     assert len(trials) == 2
     chains = [trials[0].initial, trials[0].goals[0].chain, trials[1].goals[0].chain]
     for chain, name in zip(chains, CLICKS, strict=True):
@@ -42,10 +42,10 @@ def test_chains_of_the_sample_are_those_of_the_simulated_rope(interpretation):
 
 
 @pytest.mark.long
-def test_parameters_of_the_sample_lie_in_their_intervals(interpretation):
-    read, _ = interpretation
+def test_parameters_of_the_sample_lie_in_their_intervals(drafts):
+    read, _ = drafts
     options = Options.of({**read.options, 'engine': 'compiled', 'workers': 1, 'evaluations': 80})
-    found = calibrate(read.usable, options, make_simulator=make_simulator).parameters
+    found = calibrate(read.complete, options, make_simulator=make_simulator).parameters
     for name in ('flexibility', 'friction'):
         one = found[name]
         assert one.verdict == 'identifiable'

@@ -5,48 +5,47 @@
 
 from dataclasses import replace
 
+from curve_views import curve, DIAMETER, loop, SIZE, traced, view
 import numpy as np
 import pytest
-from views import curve, DIAMETER, loop, SIZE, traced, view
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.chains import axis_of
 from dlo_calibration.capture.document import PhotographEntry, SameScale, TrialEntry
-from dlo_calibration.capture.interpretation import Interpretation
-from dlo_calibration.capture.plain_values import Values
-from dlo_calibration.capture.readings import Reading
-from dlo_calibration.capture.saving import write_request, write_session
-from dlo_calibration.capture.steps import held_after, Step
-from dlo_calibration.capture.trials import read_trial
+from dlo_calibration.capture.hands import held_after, StepEntry
+from dlo_calibration.capture.json_values import JsonValue
+from dlo_calibration.capture.measurement import Measurement
+from dlo_calibration.capture.trials import draft_trial, Drafts, write_request, write_session
 from dlo_calibration.files.request import read_request, request_trials
 from dlo_calibration.files.session import read_session
+from dlo_calibration.vision.axis import axis_of
 
 START, GOAL = curve(), curve(1.1, 0.3)
 COUNT = 21
 SCALE = view(0.5)
 
 
-def reading(points, scale=SCALE, crossings=(), above=None, sure=None, **entry):
+def measurement(points, scale=SCALE, crossings=(), above=None, sure=None, **entry):
     trace = traced(points, scale, crossings)
     if sure is not None:
         trace = replace(trace, sure=sure(len(trace.pixels)))
     axis = axis_of(trace, scale, DIAMETER, COUNT, above)
-    return Reading(PhotographEntry('aaaaaaaa', **entry), SIZE, scale=scale, trace=trace, axis=axis,
-                   above=above or {}, answered=frozenset(above or {}), thickness=DIAMETER, count=COUNT)
+    return Measurement(PhotographEntry('aaaaaaaa', **entry), SIZE, scale=scale, trace=trace, axis=axis,
+                       above=above or {}, answered=frozenset(above or {}), thickness=DIAMETER, count=COUNT)
 
 
 def step(kind, **values):
-    return Step.of(Values('step', {'kind': kind, **values}))
+    return StepEntry.of(JsonValue('step', {'kind': kind, **values}))
 
 
-def read(*steps, start=START, goal=GOAL, **entry):
-    """Return the trial of two curves [m], or of two readings."""
-    start, goal = (one if isinstance(one, Reading) else reading(one) for one in (start, goal))
-    return read_trial(1, TrialEntry('start', 'goal', steps=steps, **entry), {'start': start, 'goal': goal})
+def drafted(*steps, start=START, goal=GOAL, **entry):
+    """Return the trial of two curves [m], or of two measurements."""
+    start, goal = (one if isinstance(one, Measurement) else measurement(one) for one in (start, goal))
+    return draft_trial(1, TrialEntry('start', 'goal', steps=steps, **entry), {'start': start, 'goal': goal})
 
 
-def remedies(found):
-    return {one.remedy for one in found.remarks if one.remedy not in (None, 'mark_place')}
+def remedies(draft):
+    return {warning.remedy for warning in draft.warnings.entries
+            if warning.remedy not in (None, 'mark_place')}
 
 
 def on_curve(points, fraction):
@@ -55,8 +54,8 @@ def on_curve(points, fraction):
 
 
 def test_a_dragged_point_goes_from_its_place_in_the_start_to_that_in_the_goal():
-    found = read(step('drag', fraction=0.33, speed=0.2))
-    trial, (hand,) = found.trial, found.trial.hands
+    draft = drafted(step('drag', fraction=0.33, speed=0.2))
+    trial, (hand,) = draft.trial, draft.trial.hands
     assert [len(trial.initial), len(trial.goals[0].chain)] == [COUNT, COUNT]
     np.testing.assert_allclose(hand.positions, [on_curve(START, 0.33), on_curve(GOAL, 0.33)], atol=2e-4)
     np.testing.assert_array_equal(trial.initial.points[hand.grips[0]], hand.positions[0])
@@ -68,8 +67,8 @@ def test_a_dragged_point_goes_from_its_place_in_the_start_to_that_in_the_goal():
 
 
 def test_the_page_draws_the_hand_where_the_photographs_show_it():
-    found = read(step('drag', fraction=0.0, to=[0.1, 0.2]))
-    drawn, = found.plain['hands']
+    draft = drafted(step('drag', fraction=0.0, to=[0.1, 0.2]))
+    drawn, = draft.plain['hands']
     np.testing.assert_allclose(drawn['grip'], SCALE.to_pixels(START[:1])[0], atol=0.5)
     np.testing.assert_allclose(drawn['opens'], SCALE.to_pixels([[0.1, 0.2, DIAMETER / 2]])[0], atol=0.1)
     assert len(drawn['times']) == len(drawn['start_pixels']) == len(drawn['goal_pixels']) == 2
@@ -77,17 +76,17 @@ def test_the_page_draws_the_hand_where_the_photographs_show_it():
 
 def test_each_kind_of_step_moves_its_hand():
     rest = DIAMETER / 2
-    hand, = read(step('grasp_and_place', fraction=1.0, to=[0.2, 0.1], height=0.07)).trial.hands
+    hand, = drafted(step('grasp_and_place', fraction=1.0, to=[0.2, 0.1], height=0.07)).trial.hands
     np.testing.assert_allclose(hand.positions[1:], [
         [*hand.positions[0][:2], rest + 0.07], [0.2, 0.1, rest + 0.07], [0.2, 0.1, rest]], atol=1e-9)
-    hand, = read(step('path', fraction=1.0, waypoints=[[0, 0.1, 0.05], [0.1, 0.1, 0]])).trial.hands
+    hand, = drafted(step('path', fraction=1.0, waypoints=[[0, 0.1, 0.05], [0.1, 0.1, 0]])).trial.hands
     np.testing.assert_allclose(hand.positions[1:], [[0, 0.1, rest + 0.05], [0.1, 0.1, rest]], atol=1e-9)
-    found = read(step('two_hands', fractions=[0.2, 0.8], distance=0.06))
-    left, right = found.trial.hands
+    draft = drafted(step('two_hands', fractions=[0.2, 0.8], distance=0.06))
+    left, right = draft.trial.hands
     np.testing.assert_allclose(np.linalg.norm(left.positions[0] - right.positions[0])
                                - np.linalg.norm(left.positions[-1] - right.positions[-1]), 0.06)
-    assert found.trial.goals[0].held_by == ('left_hand', 'right_hand')
-    assert [one['opens'] for one in found.plain['hands']] == [None, None]
+    assert draft.trial.goals[0].held_by == ('left_hand', 'right_hand')
+    assert [one['opens'] for one in draft.plain['hands']] == [None, None]
 
 
 LIFT = step('lift_and_hold', fraction=0.0, height=0.1)
@@ -96,29 +95,29 @@ RIGHT = step('drag', hand='right_hand', fraction=1.0)
 
 
 def test_a_hand_that_holds_stays_until_it_opens():
-    found = read(LIFT, RIGHT, RELEASE)
-    left, right = found.trial.hands
+    draft = drafted(LIFT, RIGHT, RELEASE)
+    left, right = draft.trial.hands
     assert left.end > right.end > right.start > 1.0
     np.testing.assert_array_equal(left.positions[-1], left.positions[-2])
-    assert found.trial.goals[0].held_by == ()
+    assert draft.trial.goals[0].held_by == ()
 
 
 def test_steps_of_two_hands_can_begin_together():
-    found = read(step('drag', fraction=0.0), replace(RIGHT, with_previous=True))
-    assert [hand.start for hand in found.trial.hands] == [0.0, 0.0]
-    assert [hand.grips for hand in found.trial.hands] == [(0,), (COUNT - 1,)]
-    one_after_the_other = read(step('drag', fraction=0.0), RIGHT)
-    left, right = one_after_the_other.trial.hands
+    draft = drafted(step('drag', fraction=0.0), replace(RIGHT, with_previous=True))
+    assert [hand.start for hand in draft.trial.hands] == [0.0, 0.0]
+    assert [hand.grips for hand in draft.trial.hands] == [(0,), (COUNT - 1,)]
+    in_turn = drafted(step('drag', fraction=0.0), RIGHT)
+    left, right = in_turn.trial.hands
     assert right.start > left.end
-    assert any('Step 2 grips a point' in one.text for one in one_after_the_other.remarks)
+    assert any('Step 2 grips a point' in warning.text for warning in in_turn.warnings.entries)
 
 
 def test_a_hand_that_held_in_the_goal_before_holds_at_the_start():
     held = held_after([step('drag', fraction=0.3, hold=True)])
-    both = {'start': reading(START), 'goal': reading(GOAL)}
+    both = {'start': measurement(START), 'goal': measurement(GOAL)}
 
     def after(*steps):
-        return read_trial(2, TrialEntry('start', 'goal', steps=steps), both, held)
+        return draft_trial(2, TrialEntry('start', 'goal', steps=steps), both, held)
 
     trial = after(RIGHT).trial
     left = next(hand for hand in trial.hands if hand.name == 'left_hand')
@@ -127,7 +126,7 @@ def test_a_hand_that_held_in_the_goal_before_holds_at_the_start():
     np.testing.assert_allclose(left.positions[0], on_curve(START, 0.3), atol=2e-4)
     assert trial.goals[0].held_by == ('left_hand',)
     assert 'add_step' in remedies(after(RIGHT))
-    assert not any('left_hand' in one.text for one in after(RELEASE).remarks)
+    assert not any('left_hand' in warning.text for warning in after(RELEASE).warnings.entries)
     opened = after(RELEASE).trial
     assert ([hand.name for hand in opened.hands], opened.goals[0].held_by) == (['left_hand'], ())
     elsewhere, = after(step('drag', fraction=0.8)).trial.hands
@@ -135,22 +134,22 @@ def test_a_hand_that_held_in_the_goal_before_holds_at_the_start():
 
 
 def test_a_hand_that_held_in_the_air_needs_a_start_from_the_side():
-    both = {'start': reading(START), 'goal': reading(GOAL)}
-    found = read_trial(2, TrialEntry('start', 'goal', steps=(RELEASE,)), both, held_after([LIFT]))
-    assert found.trial is None
-    assert 'add_side' in remedies(found)
+    both = {'start': measurement(START), 'goal': measurement(GOAL)}
+    draft = draft_trial(2, TrialEntry('start', 'goal', steps=(RELEASE,)), both, held_after([LIFT]))
+    assert draft.trial is None
+    assert 'add_side' in remedies(draft)
 
 
-def test_hands_that_move_for_hours_are_told():
-    found = read(step('path', fraction=0.5, waypoints=[[0, 99, 0]], speed=0.001))
-    assert found.trial is None
-    assert any('raise their speed' in one.text for one in found.remarks)
+def test_hands_that_move_for_hours_are_refused():
+    draft = drafted(step('path', fraction=0.5, waypoints=[[0, 99, 0]], speed=0.001))
+    assert draft.trial is None
+    assert any('raise their speed' in warning.text for warning in draft.warnings.entries)
 
 
 def test_a_hand_that_goes_on_from_where_it_was_is_one_way():
-    found = read(step('path', fraction=0.5, waypoints=[[0, 0.1, 0.05]], hold=True),
+    draft = drafted(step('path', fraction=0.5, waypoints=[[0, 0.1, 0.05]], hold=True),
                  step('path', fraction=0.5, waypoints=[[0.1, 0.1, 0]]))
-    hand, = found.trial.hands
+    hand, = draft.trial.hands
     assert len(hand.times) == 4  # it waits between both
 
 
@@ -162,19 +161,19 @@ def test_a_hand_that_goes_on_from_where_it_was_is_one_way():
      'step 2, hand left'),
     ([step('two_hands', fractions=[0.4, 0.6], distance=0.5)], 'step 1, action two_hands'),
 ])
-def test_steps_that_contradict_each_other_are_told(steps, text):
-    found = read(*steps)
-    assert found.trial is None
-    refused, = (one.text for one in found.remarks if one.level == 'error')
+def test_steps_that_contradict_each_other_are_refused(steps, text):
+    draft = drafted(*steps)
+    assert draft.trial is None
+    refused, = (warning.text for warning in draft.warnings.entries if warning.level == 'error')
     assert text in refused
 
 
 @pytest.mark.parametrize('steps', [
     [LIFT], [step('two_hands', height=0.05)], [step('path', waypoints=[[0, 0, 0.1]], hold=True)]])
 def test_a_goal_in_the_air_needs_a_second_photograph(steps):
-    found = read(*steps)
-    assert found.trial is None
-    assert 'add_side' in remedies(found)
+    draft = drafted(*steps)
+    assert draft.trial is None
+    assert 'add_side' in remedies(draft)
 
 
 def test_a_lifted_goal_is_measured_in_two_photographs():
@@ -182,34 +181,34 @@ def test_a_lifted_goal_is_measured_in_two_photographs():
     t = np.clip(1 - np.linspace(0, 1, len(hung)) / 0.3, 0, 1)
     hung[:, 2] += 0.1 * (4 * t**3 - 3 * t**4)
     side = view(1.0, 0.4)
-    both = {'start': reading(START)}
+    both = {'start': measurement(START)}
     for name, scale in (('goal', SCALE), ('side', side)):
-        both[name] = replace(reading(GOAL, scale), trace=traced(hung, scale))
+        both[name] = replace(measurement(GOAL, scale), trace=traced(hung, scale))
     both['side'] = replace(both['side'], axis=None, axis_problem='above the horizon')
-    found = read_trial(1, TrialEntry('start', 'goal', goal_side='side', steps=(LIFT,)), both)
-    goal = found.trial.goals[0]
+    draft = draft_trial(1, TrialEntry('start', 'goal', goal_side='side', steps=(LIFT,)), both)
+    goal = draft.trial.goals[0]
     assert goal.held_by == ('left_hand',)
     np.testing.assert_allclose(goal.chain.points[0], hung[0], atol=2e-3)
-    np.testing.assert_allclose(found.trial.hands[0].positions[-1], goal.chain.points[0])
-    assert 'add_side' not in remedies(found)
-    too_near = read_trial(1, TrialEntry('start', 'goal', goal_side='goal', steps=(LIFT,)), both)
+    np.testing.assert_allclose(draft.trial.hands[0].positions[-1], goal.chain.points[0])
+    assert 'add_side' not in remedies(draft)
+    too_near = draft_trial(1, TrialEntry('start', 'goal', goal_side='goal', steps=(LIFT,)), both)
     assert too_near.trial is None
-    assert any('degrees' in one.text for one in too_near.remarks if one.level == 'error')
+    assert any('degrees' in warning.text for warning in too_near.warnings.entries if warning.level == 'error')
 
 
 def test_a_goal_that_is_traced_from_the_other_end_is_pointed_out():
     moved = START.copy()
     moved[300:, 1] += np.linspace(0, 0.05, 100)
-    assert remedies(read(RIGHT, goal=moved)) == set()
-    assert remedies(read(RIGHT, goal=moved[::-1])) == {'reverse_goal'}
+    assert remedies(drafted(RIGHT, goal=moved)) == set()
+    assert remedies(drafted(RIGHT, goal=moved[::-1])) == {'reverse_goal'}
 
 
-UNSURE_END = reading(curve(1.1, 0.3, 0.48), sure=lambda count: np.arange(count) > 0.05 * count)
+UNSURE_END = measurement(curve(1.1, 0.3, 0.48), sure=lambda count: np.arange(count) > 0.05 * count)
 LENGTHS = {
-    'the camera moved': (reading(curve(1.1, 0.3, 0.52), scale=SCALE, name='b'), 'camera moved'),
-    'another scale': (reading(curve(1.1, 0.3, 0.52)), 'scale is wrong'),
-    'the line ends too early': (reading(START[:-20]), 'ends too early at its last end'),
-    'it begins too late': (reading(START[20:]), 'ends too early at its first end'),
+    'the camera moved': (measurement(curve(1.1, 0.3, 0.52), scale=SCALE, name='b'), 'camera moved'),
+    'another scale': (measurement(curve(1.1, 0.3, 0.52)), 'scale is wrong'),
+    'the line ends too early': (measurement(START[:-20]), 'ends too early at its last end'),
+    'it begins too late': (measurement(START[20:]), 'ends too early at its first end'),
     'an end is not sure': (UNSURE_END, 'an end of the DLO was not found in the goal'),
 }
 
@@ -218,67 +217,67 @@ LENGTHS = {
 def test_a_length_that_differs_has_a_likely_reason(goal, reason):
     if reason == 'camera moved':
         goal = replace(goal, entry=replace(goal.entry, scale=SameScale('aaaaaaaa')))
-    found = read(step('drag', fraction=0.5), goal=goal)
-    told, = (one.text for one in found.remarks if one.remedy == 'check_length')
-    assert reason in told
-    assert found.trial is not None
+    draft = drafted(step('drag', fraction=0.5), goal=goal)
+    text, = (warning.text for warning in draft.warnings.entries if warning.remedy == 'check_length')
+    assert reason in text
+    assert draft.trial is not None
 
 
-def test_lengths_that_differ_little_are_no_remark():
-    assert remedies(read(step('drag', fraction=0.5), goal=curve(1.1, 0.3, 0.505))) == set()
+def test_lengths_that_differ_little_cause_no_warning():
+    assert remedies(drafted(step('drag', fraction=0.5), goal=curve(1.1, 0.3, 0.505))) == set()
 
 
 @pytest.mark.parametrize('fraction, to, hold, level', [
     (0.0, None, False, 'warning'), (0.4, None, False, 'hint'), (0.0, [0.1, 0.2], False, None),
     (0.0, None, True, None)])
 def test_where_an_end_was_let_go_should_be_marked(fraction, to, hold, level):
-    found = read(step('drag', fraction=fraction, to=to, hold=hold))
-    levels = [one.level for one in found.remarks if one.remedy == 'mark_place']
+    draft = drafted(step('drag', fraction=fraction, to=to, hold=hold))
+    levels = [warning.level for warning in draft.warnings.entries if warning.remedy == 'mark_place']
     assert levels == ([] if level is None else [level])
 
 
 def test_who_is_above_is_asked_until_it_is_answered():
     points, pair = loop()
-    open_, answered = (reading(points, crossings=[pair], above=above) for above in (None, {0: True}))
-    assert remedies(read(RIGHT, start=open_, goal=answered)) == {'ask_crossings'}
-    found = read(RIGHT, start=answered, goal=answered)
-    assert remedies(found) == set()
-    assert found.trial.initial.points[:, 2].max() > 1.5 * DIAMETER
+    open_, answered = (measurement(points, crossings=[pair], above=above) for above in (None, {0: True}))
+    assert remedies(drafted(RIGHT, start=open_, goal=answered)) == {'ask_crossings'}
+    draft = drafted(RIGHT, start=answered, goal=answered)
+    assert remedies(draft) == set()
+    assert draft.trial.initial.points[:, 2].max() > 1.5 * DIAMETER
 
 
 @pytest.mark.parametrize('change, remedy', [
     ({'scale': None, 'axis': None}, 'set_scale'), ({'scale_problem': 'no board', 'axis': None}, 'set_scale'),
     ({'trace': None, 'axis': None}, 'add_click'), ({'trace_problem': 'no DLO', 'axis': None}, 'add_click')])
 def test_what_is_missing_is_asked_for(change, remedy):
-    found = read(RIGHT, goal=replace(reading(GOAL), **change))
-    assert found.trial is None
-    assert remedies(found) == {remedy}
-    assert found.plain['complete'] is False
+    draft = drafted(RIGHT, goal=replace(measurement(GOAL), **change))
+    assert draft.trial is None
+    assert remedies(draft) == {remedy}
+    assert draft.plain['complete'] is False
 
 
 def test_a_trial_without_goal_or_steps_is_not_complete():
-    found = read_trial(1, TrialEntry('start'), {'start': reading(START)})
-    assert remedies(found) == {'add_goal', 'add_step'}
-    assert found.lengths[0] == pytest.approx(0.5, abs=1e-3)
+    draft = draft_trial(1, TrialEntry('start'), {'start': measurement(START)})
+    assert remedies(draft) == {'add_goal', 'add_step'}
+    assert draft.lengths[0] == pytest.approx(0.5, abs=1e-3)
 
 
 def test_session_and_request_have_the_same_trials(tmp_path):
     points, pair = loop()
-    start, goal = (reading(points, view(tilt), [pair], {0: True}) for tilt in (0.0, 0.2))
-    trials = (read(RIGHT), read(LIFT, RIGHT, RELEASE), read(step('two_hands', fractions=[0.2, 0.8])),
-              read(), read(step('drag', fraction=0.4), start=start, goal=goal))
-    interpretation = Interpretation({'a': reading(START)}, trials, mass=0.03)
-    assert len(interpretation.usable) == 4
-    write_session(tmp_path / 'session.mcap', interpretation.usable, interpretation.options)
-    write_request(tmp_path / 'request.xml', interpretation.usable, interpretation.options)
+    start, goal = (measurement(points, view(tilt), [pair], {0: True}) for tilt in (0.0, 0.2))
+    trials = (drafted(RIGHT), drafted(LIFT, RIGHT, RELEASE), drafted(step('two_hands', fractions=[0.2, 0.8])),
+              drafted(), drafted(step('drag', fraction=0.4), start=start, goal=goal))
+    drafts = Drafts({'a': measurement(START)}, trials, mass=0.03)
+    assert len(drafts.complete) == 4
+    write_session(tmp_path / 'session.mcap', drafts.complete, drafts.options)
+    write_request(tmp_path / 'request.xml', drafts.complete, drafts.options)
     session, request = read_session(tmp_path / 'session.mcap'), read_request(tmp_path / 'request.xml')
     assert session.problems == request.problems == ()
     assert session.options == Options.of(request.options) == Options.of(
-        {**interpretation.options, 'workers': 0})
+        {**drafts.options, 'workers': 0})
     assert session.options.mass == 0.03
     assert session.options.space.physical({}, 0.5)['self_collision'] == pytest.approx(DIAMETER / 2)
-    for found in (session.trials, request_trials(request, session.options)[0]):
-        for one, other in zip(found, interpretation.usable, strict=True):
+    for trials in (session.trials, request_trials(request, session.options)[0]):
+        for one, other in zip(trials, drafts.complete, strict=True):
             assert (one.name, one.goals[0].time, one.goals[0].held_by) == (
                 other.name, other.goals[0].time, other.goals[0].held_by)
             pairs = [(one.initial, other.initial), (one.goals[0].chain, other.goals[0].chain)]

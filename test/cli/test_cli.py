@@ -19,14 +19,14 @@ import sys
 import time
 
 import pytest
-from serial import serial
+from toy_command import one_worker
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration import stages
-from dlo_calibration.calibration.options import declarations, Options
-from dlo_calibration.cli import fit, result_files
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.result import read_result
@@ -34,6 +34,7 @@ from dlo_calibration.files.session import read_session
 from dlo_calibration.inference.slices import simulate_slices
 from dlo_calibration.messages.codec import bag_types, GOAL, INITIAL
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
+from dlo_calibration.workspace import folder as calibration_folder
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -59,7 +60,7 @@ def run(capsys):
     """Give a function that returns exit code, stdout and stderr of a command with the toy."""
     def run(*words, toy=None):
         try:
-            code = cli.main(serial(words), lambda options: toy or ToySimulator())
+            code = cli.main(one_worker(words), lambda options: toy or ToySimulator())
         except SystemExit as end:  # argparse
             code = end.code
         output, errors = capsys.readouterr()
@@ -154,18 +155,18 @@ def test_fit_writes_result_session_and_report_that_repeat_it(run, tmp_path, monk
     assert float(best['friction']) == first['parameters']['friction']['value']
 
 
-def test_fit_prints_what_it_found_where_the_disk_is_full_by_then(run, session, tmp_path, monkeypatch):
+def test_fit_prints_its_result_though_the_disk_is_full(run, session, tmp_path, monkeypatch):
     def full(*_):
         raise InputError('file result.xml', 'No space left on device', 'room for it', 'make room')
 
-    monkeypatch.setattr(result_files, 'write_result', full)
+    monkeypatch.setattr(calibration_folder, 'write_result', full)
     code, output, errors = run('fit', session, '--json', '--output', tmp_path / 'out', '--evaluations', 3)
     assert code == 2
     assert 'No space left on device' in errors
     assert only_json(output)['evaluations'] == 3
 
 
-def test_files_that_fail_prevent_no_other_and_old_ones_stay(run, session, tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_written_costs_no_other_and_no_older_one(run, session, tmp_path, monkeypatch):
     folder = tmp_path / 'out'
     assert run('fit', session, '--output', folder, '--evaluations', 2)[0] == 0
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
@@ -176,12 +177,12 @@ def test_files_that_fail_prevent_no_other_and_old_ones_stay(run, session, tmp_pa
 
     with monkeypatch.context() as patch:
         patch.setattr(shutil, 'copyfile', full)
-        patch.setattr('dlo_calibration.files.evaluations.csv.writer', full)
+        patch.setattr('dlo_calibration.files.result.csv.writer', full)
         code, output, errors = run('fit', session, '--json', '--output', folder, '--evaluations', 3)
     assert code == 2
     assert only_json(output)['evaluations'] == 3
     last = errors.splitlines()[-1]
-    assert 'session.mcap (an older one is there), evaluations.csv: No space left on device' in last
+    assert 'evaluations.csv, session.mcap (an older one is there): No space left on device' in last
     assert 'result.xml, report.html could be' in last
     assert read_result(folder / 'result.xml').evaluations == 3
     assert (folder / 'session.mcap').read_bytes() == before['session.mcap']
@@ -218,7 +219,7 @@ def test_validate_on_another_session_uses_the_results_parameters(run, session, t
     assert found['seed'] == 1
 
 
-def test_info_tells_what_is_in_a_session(run, session):
+def test_info_shows_the_content_of_a_session(run, session):
     code, output, _ = run('info', session, '--json')
     found = only_json(output)
     assert code == 0
@@ -235,7 +236,7 @@ def test_info_tells_what_is_in_a_session(run, session):
     assert 'Calibrated' not in for_people and 'evaluations 20' in for_people
 
 
-def test_info_tells_of_how_many_chains_a_goal_is_the_mean(run, tmp_path):
+def test_info_says_how_many_chains_a_goal_averages(run, tmp_path):
     messages = session_messages(TYPES, 1)
     (_, goal), = (pair for pair in messages if pair[0] == GOAL)
     later = []
@@ -250,7 +251,7 @@ def test_info_tells_of_how_many_chains_a_goal_is_the_mean(run, tmp_path):
     assert f"mean of {trial['averaged_chains']}" in run('info', tmp_path / 'stream.mcap')[1]
 
 
-def test_info_tells_what_is_wrong_with_a_session(run, tmp_path):
+def test_info_shows_the_warnings_about_a_session(run, tmp_path):
     pairs = session_messages(TYPES, 2)
     pairs[5][1].header.frame_id = 'camera'
     path = write_session(tmp_path / 'wrong.mcap', pairs)
@@ -299,7 +300,7 @@ def test_every_option_is_a_flag_with_either_hyphen(run, session):
     flat = Options().flat()
     for hyphen in '_-':
         words = []
-        for declaration in declarations():
+        for declaration in Options.declarations():
             if declaration.choices or declaration.name in ('evaluations', 'output_directory'):
                 continue
             name, value = declaration.name.replace('_', hyphen), flat[declaration.name]
@@ -335,7 +336,7 @@ def test_stiffness_is_per_weight_unless_the_mass_is_given(run, session):
 
 PROGRAM = """
 import pathlib, sys, threading
-from drawings import leave_out_drawings, leave_out_slices
+from without_drawings import leave_out_drawings, leave_out_slices
 from toy_simulator import Stoppable, ToySimulator
 from dlo_calibration.cli import main as cli
 from dlo_calibration.report import terminal
@@ -429,12 +430,12 @@ def test_a_session_with_a_scene_is_repeated_with_it(tmp_path, monkeypatch, capsy
     scene.unlink()
     assert cli.main(['fit', str(session)]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith('dlo-calibration: recorded scene my scene.urdf: got no such file ')
+    assert error.startswith('dlo-calibration: recorded scene my scene.urdf: no such file ')
     assert 'give it with --scene' in error
 
 
 def test_compiled_engine_and_scene_end_with_one_line(session, capsys):
     assert cli.main(['fit', str(session), '--engine', 'compiled', '--scene', 'peg.urdf']) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        'dlo-calibration: engine compiled: got scene peg.urdf, expected no scene: it simulates only a table; '
+        'dlo-calibration: engine compiled: scene peg.urdf; expected no scene: it simulates only a table; '
         'use engine bullet or auto')

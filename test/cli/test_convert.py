@@ -135,7 +135,7 @@ def test_hanging_wire_is_led_to_its_clamps_and_never_stretched(data):
 @pytest.mark.parametrize('arguments', [
     ('hanging', 'red', 'out'), ('mocap', 'dlo2', 'out', '--recordings', '7'),
     ('hanging', 'white', 'out', '--repeats', 'first'), ('mocap', 'dlo2', 'out', '--every', '0')])
-def test_what_is_not_there_is_refused_in_one_line(data, arguments, capsys, monkeypatch):
+def test_missing_recordings_are_refused_in_one_line(data, arguments, capsys, monkeypatch):
     monkeypatch.chdir(data)
     assert convert.main(['--data', str(data), *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

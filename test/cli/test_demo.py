@@ -13,8 +13,7 @@ from processes import children
 import pytest
 from toy_messages import session_messages, write_session
 
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import read_session
+from dlo_calibration.files.session import read_session, samples
 from dlo_calibration.messages.codec import bag_types
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')

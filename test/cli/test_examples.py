@@ -10,8 +10,8 @@ import signal
 import subprocess
 import sys
 
-from graph import child, ended
 import pytest
+from ros_robot import child, ended
 
 from dlo_calibration.files.session import read_session
 
@@ -45,7 +45,7 @@ def test_robot_session_sends_trials_starts_and_hears_the_result(ros_environment,
 @pytest.mark.long
 def test_closed_loop_plans_and_executes_until_the_goal_is_reached(ros_environment):
     planner = subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration.ros.planner', '--ros-args', '-p', 'workers:=1',
+        [sys.executable, '-m', 'dlo_calibration.ros.executable', 'planner', '--ros-args', '-p', 'workers:=1',
          '-p', f'description:={ROOT / "msg_samples" / "xml" / "dlo.xml"}',
          '-p', 'tolerance:=12.0', '-p', 'draws:=0'],  # one action is enough
         env={**ros_environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stderr=subprocess.PIPE, text=True)

@@ -22,7 +22,7 @@ from toy_calibrator import make_toy
 from toy_messages import session_messages, TRUTH, write_session
 
 from dlo_calibration.cli import main as cli
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 from dlo_calibration.messages.codec import bag_types
 
 PATIENCE = 60.0
@@ -88,7 +88,7 @@ def test_all_files_are_written_and_the_tables_printed(run, session, tmp_path):
             assert min(Image.open(tmp_path / 'out' / name).size) > 300
 
 
-def test_the_json_document_is_the_file_and_tells_the_truth_that_was_found(run, session, tmp_path, undrawn):
+def test_the_json_document_is_the_file_and_has_the_recovered_truth(run, session, tmp_path, undrawn):
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--json',
                           '--output', tmp_path / 'out')
     found = json.loads(output)
@@ -112,7 +112,7 @@ def test_the_numbers_are_the_same_for_any_number_of_processes(run, session, tmp_
     assert first == second
 
 
-def test_what_is_done_is_not_done_again_and_more_runs_come_on_top(run, session, tmp_path, undrawn):
+def test_finished_calibrations_are_not_repeated_and_more_runs_are_added(run, session, tmp_path, undrawn):
     out, journal = tmp_path / 'out', tmp_path / 'out' / 'calibrations.jsonl'
     run(session, *SMALL, '--output', out)
     before = journal.read_bytes()
@@ -144,7 +144,7 @@ def test_chosen_trials_are_held_back(run, session, tmp_path, undrawn):
     assert '--held-back 2' in found['command']
 
 
-def test_another_session_may_judge(run, session, tmp_path, undrawn):
+def test_parameters_are_validated_on_another_session(run, session, tmp_path, undrawn):
     other = write_session(tmp_path / 'other.mcap', session_messages(bag_types(), 2, first=3), {'seed': 3})
     code, output, _ = run(session, '--runs', 2, '--search', 'least_squares', '--validate-on', other, '--json',
                           '--output', tmp_path / 'out')
@@ -196,7 +196,7 @@ def started(session, out, workers):
 
 
 @pytest.mark.long
-def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, undrawn):
+def test_a_killed_experiment_goes_on_where_it_was(run, session, tmp_path, undrawn):
     out = tmp_path / 'out'
     process = started(session, out, 2)
     begun = children(process.pid)
@@ -216,7 +216,7 @@ def test_killed_in_the_middle_it_goes_on_from_there(run, session, tmp_path, undr
         time.sleep(0.02)
 
 
-def test_what_cannot_be_written_is_named_and_the_tables_are_told(run, session, tmp_path, undrawn,
+def test_files_that_cannot_be_written_are_named_and_the_tables_are_printed(run, session, tmp_path, undrawn,
                                                                  monkeypatch):
     monkeypatch.chdir(tmp_path)  # a long path would shorten the sentence
     out, replace, fsync = Path('out'), os.replace, os.fsync
@@ -258,7 +258,7 @@ def test_a_journal_that_is_no_file_is_refused_at_once(run, session, tmp_path, ma
 
 @pytest.mark.parametrize(('workers', 'number'), [
     pytest.param(1, signal.SIGINT, marks=pytest.mark.long), (2, signal.SIGTERM)])
-def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
+def test_an_interrupt_keeps_finished_calibrations(session, tmp_path, workers, number):
     process = started(session, tmp_path / 'out', workers)
     process.send_signal(number)
     _, errors = process.communicate(timeout=PATIENCE)
@@ -272,15 +272,15 @@ def test_an_interrupt_keeps_what_is_done(session, tmp_path, workers, number):
 
 @pytest.mark.parametrize(('words', 'said'), [
     (('nowhere',), 'nowhere'),
-    (('{session}', '--runs', '0'), '--runs: got 0'),
-    (('{session}', '--search', 'guess'), "parameter search: got 'guess'"),
-    (('{session}', '--search', ','), '--search: got no name'),
-    (('{session}', '--held-back', '4'), '--held-back: got 4, expected 1 to 3'),
+    (('{session}', '--runs', '0'), '--runs: 0'),
+    (('{session}', '--search', 'guess'), "parameter search: 'guess'"),
+    (('{session}', '--search', ','), '--search: no name'),
+    (('{session}', '--held-back', '4'), '--held-back: 4; expected 1 to 3'),
     (('{session}', '--held-back', 'x'), '--held-back'),
     (('{session}', '--held-back', '1', '--validate-on', '{session}'), 'not allowed with'),
-    (('{session}', '--validate-on', '{session}', '{session}'), '--validate-on: got 2 session(s)'),
+    (('{session}', '--validate-on', '{session}', '{session}'), '--validate-on: 2 session(s)'),
     (('{session}', '--mass', '-1'), 'parameter mass'),
-    (('{session}', '--output', '{session}'), '--output'),
+    (('{session}', '--output', '{session}'), 'choose another place'),
     (('{session}', '--record'), '--record'),
 ], ids=lambda one: one if isinstance(one, str) else None)
 def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
@@ -290,7 +290,7 @@ def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):
     assert len(errors.splitlines()) == 1
 
 
-def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path, undrawn):
+def test_a_session_of_one_trial_cannot_be_cross_validated(run, tmp_path, undrawn):
     short = write_session(tmp_path / 'short.mcap', session_messages(bag_types(), 1))
     code, _, errors = run(short, '--output', tmp_path / 'out')
     assert code == 2
@@ -300,7 +300,7 @@ def test_a_session_of_one_trial_cannot_judge_itself(run, tmp_path, undrawn):
                '--output', tmp_path / 'out')[0] == 0
 
 
-def test_what_fails_everywhere_is_told_in_the_table(session, tmp_path, capsys):
+def test_the_table_says_which_calibrations_failed(session, tmp_path, capsys):
     from toy_simulator import ToySimulator
     code = cli.main(['experiment', str(session), '--runs', '1', '--search', 'random', '--evaluations', '3',
                      '--workers', '1', '--output', str(tmp_path / 'out')],

@@ -10,7 +10,7 @@ from dlo_calibration.cli import main as cli
 from dlo_calibration.export import export_mjcf, export_sdf, export_usd
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.result import read_result
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 
 ROPE, START = samples() / 'xml/dlo.xml', samples() / 'chains/start.csv'
 
@@ -30,13 +30,13 @@ def export(capsys, tmp_path):
 
 
 @pytest.mark.parametrize('name, function', [('mjcf', export_mjcf), ('usd', export_usd), ('sdf', export_sdf)])
-def test_it_writes_what_the_function_returns(export, name, function):
+def test_export_writes_what_the_function_returns(export, name, function):
     code, _, file = export('--format', name)
     assert code == 0
     assert file.read_text() == function(read_result(ROPE), read_chain_file(START))
 
 
-def test_it_takes_a_form_and_options(export):
+def test_export_takes_a_form_and_options(export):
     code, _, file = export('--format', 'mjcf', '--form', 'inextensible', '--nodes', '11', '--no-table')
     assert code == 0
     text = file.read_text()
@@ -44,7 +44,7 @@ def test_it_takes_a_form_and_options(export):
     assert 'name="dlo_9"' in text and 'name="dlo_10"' not in text
 
 
-def test_it_tells_what_is_doubtful_or_not_known(export, tmp_path):
+def test_warnings_about_the_exported_dlo_are_printed(export, tmp_path):
     in_millimetres = tmp_path / 'start.csv'
     np.savetxt(in_millimetres, 1000 * read_chain_file(START).points, delimiter=',')
     code, told, _ = export('--format', 'sdf', start=in_millimetres)
@@ -53,19 +53,19 @@ def test_it_tells_what_is_doubtful_or_not_known(export, tmp_path):
 
 
 @pytest.mark.parametrize('words, said', [
-    (['--format', 'mjcf', '--form', 'soft'], "'soft', expected one of extensible, inextensible"),
+    (['--format', 'mjcf', '--form', 'soft'], "'soft'; expected one of extensible, inextensible"),
     (['--format', 'sdf', '--form', 'soft'], 'sdf has only one'),
     (['--format', 'urdf'], 'urdf'),
     (['--format', 'mjcf', '--nodes', '3'], 'nodes'),
 ])
-def test_it_refuses_in_one_line_what_it_does_not_know(export, words, said):
+def test_unknown_formats_and_forms_are_refused_in_one_line(export, words, said):
     code, error, file = export(*words)
     assert code == 2
     assert said in error and error.count('\n') == 1
     assert not file.exists()
 
 
-def test_it_refuses_a_result_that_is_none(export):
+def test_a_file_that_is_no_result_is_refused(export):
     code, error, _ = export('--format', 'mjcf', result=START)
     assert code == 2
     assert error.count('\n') == 1

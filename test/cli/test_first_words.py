@@ -14,9 +14,9 @@ SESSION, RESULT = str(SAMPLES / 'object1'), str(SAMPLES / 'xml/dlo.xml')
 
 
 @pytest.mark.parametrize('words, remedy', [
-    ([], 'expected one of capture, trace,'), (['fit', 'nowhere'], 'got No such file or directory'),
+    ([], 'expected one of capture, trace,'), (['fit', 'nowhere'], 'No such file or directory'),
     (['fit', str(SAMPLES / 'photographs/first.jpg')], 'or an XML request (.xml)'),
-    (['fit', SESSION, '--output', RESULT], 'got a file of this name, expected a folder'),
+    (['fit', SESSION, '--output', RESULT], 'a file of this name; expected a folder'),
     *((words, 'name RESULT.xml and SESSION in the other order') for words in (
         ['validate', SESSION, RESULT], ['simulate', SESSION, RESULT], ['plot', RESULT, SESSION]))])
 def test_the_answer_is_one_sentence_with_the_remedy(words, remedy, capsys):

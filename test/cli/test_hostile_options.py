@@ -12,9 +12,13 @@ from toy_messages import session_messages, toy_trials, write_session
 from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
-from dlo_calibration.calibration.declaration import MACHINE, OBSERVATION, SEARCH
-from dlo_calibration.calibration.file_options import file_options
-from dlo_calibration.calibration.options import declarations, Options
+from dlo_calibration.calibration.options import (
+    file_options,
+    MACHINE,
+    OBSERVATION,
+    Options,
+    SEARCH,
+)
 from dlo_calibration.cli import fit
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
@@ -27,7 +31,7 @@ from dlo_calibration.messages.codec import bag_types
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
 TYPES = bag_types()
-DECLARED = list(declarations())
+DECLARED = list(Options.declarations())
 OF_THE_MACHINE = {
     'workers': 61, 'scheduler': 'tcp://attacker.example:8786', 'start_after_trials': 3,
     'output_directory': '/tmp/attacker', 'record': False, 'answer_limit': 86400.0}
@@ -177,7 +181,7 @@ def test_a_scene_that_was_elsewhere_is_found_in_the_folder_of_the_file(tmp_path)
     'outside', '../secret.urdf', 'link.urdf', 'linked/secret.urdf', 'pipe', '.', '/dev/zero',
     '/proc/self/mem', 'nowhere.urdf', '//server/share/scene.urdf', 'http://server/scene.urdf', 'a\0b', 'loop',
     5000 * 'x'], ids=lambda name: ascii(name[:20]))
-def test_no_other_file_is_taken_as_a_scene(name, tmp_path):
+def test_a_file_elsewhere_is_not_taken_as_a_scene(name, tmp_path):
     folder, secret = tmp_path / 'given', tmp_path / 'secret.urdf'
     folder.mkdir()
     secret.write_text('<robot/>', encoding='utf-8')
@@ -204,7 +208,7 @@ def test_a_foreign_scene_is_refused_until_it_is_given(write, tmp_path, reached, 
     assert cli.main(line, reached.make) == 2
     errors = capsys.readouterr().err.splitlines()
     assert reached == [] and [text for text in errors if 'scene' in text] == errors[-1:]
-    assert errors[-1].startswith(f'dlo-calibration: recorded scene {secret}: got no such file in the folder')
+    assert errors[-1].startswith(f'dlo-calibration: recorded scene {secret}: no such file in the folder')
     cli.main([*line, '--scene', str(secret)], reached.make)
     assert reached[0].scene == str(secret)
     if write is not result_file:

@@ -8,13 +8,12 @@ import sys
 
 import numpy as np
 from PIL import Image, ImageColor
+from plan_executions import Belief, TRUE
 import pytest
+from reality import KNOWN_DLOS, laid, POINTS
 
 from dlo_calibration import Chain, Options
 from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.experiment.knowledge import Knowledge, TRUE
-from dlo_calibration.experiment.known_dlos import KNOWN_DLOS
-from dlo_calibration.experiment.pairs import laid, POINTS
 from dlo_calibration.model.named_actions import GraspAndPlace
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
@@ -47,7 +46,7 @@ def test_ropes_hold_the_letters_for_which_the_strokes_are_too_sharp(examples):
     for name, corners in letters.LETTERS.values():
         dlo, = (one for one in KNOWN_DLOS if one.name == name)
         stroke = letters.stroke(corners, dlo.length)
-        held = letters.held(stroke, Knowledge.without_doubt(TRUE, dlo))
+        held = letters.held(stroke, Belief.certain(TRUE, dlo))
         assert away(held, stroke) < 0.01 * dlo.length  # it still is that letter
         goal, sharp = whole_chain(held, dlo), whole_chain(stroke, dlo)
         assert away(laid(dlo, goal, with_true), goal) < 0.001 * dlo.length

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.capture.plain_values import Entry
+from dlo_calibration.capture.json_values import JsonValue
 from dlo_calibration.cli import main as cli
 from dlo_calibration.errors import InputError
 from dlo_calibration.files.request import request_of
@@ -25,7 +25,7 @@ OBJECT = str(SAMPLES / 'object1')
     (f'fit {OBJECT} --search least-square', 'least_squares'), (f'fit {OBJECT} --engine Bulet', 'bullet'),
     (f'fit {OBJECT} --calibrate flexibilty friction', 'flexibility'),
     ('experiment --search lest_squares', 'least_squares')])
-def test_the_command_line_names_what_was_meant(words, meant, capsys):
+def test_a_misspelt_word_of_the_command_line_gets_a_suggestion(words, meant, capsys):
     try:
         code = cli.main(words.split())
     except SystemExit as end:
@@ -35,7 +35,7 @@ def test_the_command_line_names_what_was_meant(words, meant, capsys):
     assert f'did you mean {meant}?' in errors
 
 
-def test_a_name_that_resembles_none_is_only_refused(capsys):
+def test_a_name_that_resembles_none_gets_no_suggestion(capsys):
     assert cli.main(['zzz']) == 2
     assert 'did you mean' not in capsys.readouterr().err
 
@@ -44,14 +44,14 @@ def test_a_name_that_resembles_none_is_only_refused(capsys):
     ('<grasp_and_plase', '<grasp_and_place', 'grasp_and_place'), (' sped=', ' speed=', 'speed'),
     ('"togeter"', '"together"', 'together'), ('"evalutions"', '"evaluations"', 'evaluations'),
     ('name="search" value="randon"', 'name="seed" value="1"', 'random')])
-def test_a_document_names_what_was_meant(wrong, right, meant):
+def test_a_misspelt_name_in_a_document_gets_a_suggestion(wrong, right, meant):
     text = (SAMPLES / 'xml' / 'named_actions.xml').read_text(encoding='utf-8')
     assert right in text
     with pytest.raises(InputError, match=rf'did you mean {meant}\?'):
         request_of(text.replace(right, wrong).encode())
 
 
-def test_a_place_that_is_wrong_is_no_misspelling():
+def test_a_known_name_in_the_wrong_place_gets_no_suggestion():
     text = (SAMPLES / 'xml' / 'named_actions.xml').read_text(encoding='utf-8')
     with pytest.raises(InputError) as refused:
         request_of(text.replace('<initial_chain', '<goal_chain', 1).replace(
@@ -63,8 +63,8 @@ def test_a_place_that_is_wrong_is_no_misspelling():
     (lambda: Options.of({'sead': 2}), 'seed'), (lambda: Options(search='cmaes'), 'cma_es'),
     (lambda: ParameterSpace(('frction',)), 'friction'),
     (lambda: TwoHands(fractions=(0.1, 0.9), motion='togther'), 'together'),
-    (lambda: Entry('', {'photografs': []}).values('photographs', 'trials'), 'photographs')],
+    (lambda: JsonValue('', {'photografs': []}).only('photographs', 'trials'), 'photographs')],
     ids=['option', 'search', 'parameter', 'named action', 'JSON'])
-def test_the_library_names_what_was_meant(make, meant):
+def test_a_misspelt_name_in_the_library_gets_a_suggestion(make, meant):
     with pytest.raises(InputError, match=rf'did you mean {meant}\?'):
         make()

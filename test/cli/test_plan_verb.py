@@ -7,8 +7,7 @@ import json
 import os
 import signal
 
-from calibrated import straight
-from made_up_plan import made_up_plan
+from made_up_dlo import made_up_plan, straight
 import numpy as np
 from PIL import Image
 import pytest
@@ -17,7 +16,7 @@ from dlo_calibration import Chain, Options, read_result
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.chain_file import read_chain_file, write_chain
 from dlo_calibration.files.request import read_request, request_manipulations
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 from dlo_calibration.model.named_actions import GraspAndPlace
 from dlo_calibration.planning.prediction import simulate
 from dlo_calibration.writing import whole
@@ -103,8 +102,8 @@ def test_a_plan_is_found_and_its_files_lead_to_the_goal(run, chains, tmp_path):
     assert Image.open(folder / 'plan.gif').n_frames > 1
 
 
-def test_people_are_told_each_action_and_whether_the_goal_is_reached(run, chains, planned):
-    planned(remarks=('The goal is longer than the DLO.',))
+def test_each_action_is_described_and_whether_the_goal_is_reached(run, chains, planned):
+    planned(warnings=('The goal is longer than the DLO.',))
     code, output, _ = run('plan', ROPE, *chains)
     assert code == 0
     text = ' '.join(output.split())
@@ -145,7 +144,7 @@ def test_a_file_that_cannot_be_written_prevents_no_other_and_no_output(run, chai
     assert (tmp_path / 'out' / 'plan.gif').is_file()
 
 
-def test_who_does_not_wait_for_the_drawings_has_the_plan(run, chains, planned, tmp_path, monkeypatch):
+def test_the_plan_is_printed_before_the_drawings(run, chains, planned, tmp_path, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt(130)
 
@@ -166,7 +165,7 @@ def test_a_plan_that_is_stopped_is_the_best_so_far(run, chains, planned, actions
     assert asked[0][-1]['should_stop']()
 
 
-def test_only_numbers_that_exist_are_in_the_document(run, chains, planned):
+def test_the_document_has_null_for_unknown_numbers(run, chains, planned):
     planned(score_after=float('nan'))
     assert json.loads(run('plan', ROPE, *chains, '--json')[1])['score_after'] is None
 
@@ -178,7 +177,7 @@ def test_only_numbers_that_exist_are_in_the_document(run, chains, planned):
     ('0,0,0.004\n300,0,0.004\n600,0,0.004\n', 'length'),
     ('0,0,0.5\n0.3,0,0.5\n0.6,0,0.5\n', 'above the table'),
 ])
-def test_a_goal_that_cannot_be_one_is_refused_in_a_sentence(run, chains, tmp_path, text, words):
+def test_an_impossible_goal_is_refused_in_a_sentence(run, chains, tmp_path, text, words):
     (tmp_path / 'bad.csv').write_text(text)
     code, output, errors = run('plan', ROPE, *chains[:3], tmp_path / 'bad.csv', '--workers', 1,
                                '--output', tmp_path / 'out')
@@ -189,7 +188,7 @@ def test_a_goal_that_cannot_be_one_is_refused_in_a_sentence(run, chains, tmp_pat
 
 
 @pytest.mark.parametrize('words, complaint', [
-    (('--hands', '3'), 'parameter hands: got 3'),
+    (('--hands', '3'), 'parameter hands: 3'),
     (('--reach-1', 'ball 1'), 'reach_1'),
     (('--mass', '1'), 'unrecognized arguments: --mass'),
 ])
@@ -200,7 +199,7 @@ def test_a_flag_that_cannot_be_used_is_refused_in_a_sentence(run, chains, words,
     assert complaint in line
 
 
-def test_a_result_that_is_none_is_refused_in_a_sentence(run, chains, tmp_path):
+def test_a_file_that_is_no_result_is_refused_in_a_sentence(run, chains, tmp_path):
     code, _, errors = run('plan', tmp_path / 'none.xml', *chains)
     assert code == 2
     assert 'none.xml' in errors and len(errors.splitlines()) == 1

@@ -94,7 +94,7 @@ def test_a_picture_that_cannot_be_written_prevents_no_other(run, session, tmp_pa
     assert (tmp_path / 'elsewhere').read_text() == 'precious'
 
 
-def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
+def test_pictures_go_to_the_working_directory_by_default(run, session, tmp_path, monkeypatch):
     monkeypatch.setattr('dlo_calibration.report.drawing.session_picture',
                         lambda trials, chains, path: path.touch())
     (tmp_path / 'here').mkdir()
@@ -105,7 +105,7 @@ def test_without_folder_the_files_go_here(run, session, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(('words', 'said'), [
     (['--animation'], 'RESULT.xml'),
-    (['--output', '{session}'], '--output'),
+    (['--output', '{session}'], 'choose another place'),
     (['{session}'], 'recorded.mcap'),
 ], ids=['animation of nothing', 'folder that is a file', 'result that is none'])
 def test_what_cannot_be_used_ends_with_one_line(run, session, words, said):

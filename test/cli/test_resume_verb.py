@@ -10,16 +10,16 @@ import signal
 import subprocess
 import sys
 
-import mortal
-from mortal import Mortal
+import killed_command
 import pytest
-from serial import serial
+from toy_command import one_worker
 from toy_messages import session_messages, write_session
+from toy_simulator import CountingToy
 
 from dlo_calibration.cli import main as cli
-from dlo_calibration.cli.result_files import EVALUATIONS, REPORT, REQUEST, RESULT, SESSION
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
+from dlo_calibration.workspace.folder import EVALUATIONS, REPORT, REQUEST, RESULT, SESSION
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -38,8 +38,8 @@ def session(tmp_path):
 def act(capsys):
     """Give a function that executes a verb: its code, its output and errors, and its engine."""
     def act(*words, toy=None):
-        toy = toy or Mortal()
-        code = cli.main(serial(words), lambda _: toy)
+        toy = toy or CountingToy()
+        code = cli.main(one_worker(words), lambda _: toy)
         return code, *capsys.readouterr(), toy
 
     return act
@@ -58,7 +58,7 @@ def abandon(act):
     """Give a function that executes a verb up to a simulation, at which it is abandoned."""
     def abandon(simulation, *words):
         with pytest.raises(Killed):
-            act(*words, toy=Mortal(last=simulation, die=die))
+            act(*words, toy=CountingToy(last=simulation, die=die))
 
     return abandon
 
@@ -66,8 +66,8 @@ def abandon(act):
 def killed(simulation, *words):
     """Execute a verb in a process that is killed at a simulation."""
     done = subprocess.run(
-        [sys.executable, mortal.__file__, str(simulation), *serial(words)], capture_output=True, text=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
+        [sys.executable, killed_command.__file__, str(simulation), *one_worker(words)],
+        capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
@@ -75,7 +75,7 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def told(folder):
+def content(folder):
     """Return what a folder tells, without the time that it took."""
     result = (folder / RESULT).read_text(encoding='utf-8')
     seconds = f'seconds="{read_result(folder / RESULT).seconds!r}"'
@@ -95,7 +95,7 @@ def test_a_killed_fit_goes_on_to_the_same_files(session, tmp_path, act):
     assert code == 0
     assert 'goes on after ' in errors
     assert toy.count <= whole.count - 29 + 1  # the kill costs at most the first trial of an evaluation
-    assert told(out) == told(tmp_path / 'whole')
+    assert content(out) == content(tmp_path / 'whole')
     assert names(out) == FINISHED
     code, output, errors, toy = act('fit', '--resume', out)
     assert (code, output, toy.count) == (0, '', 0)
@@ -114,7 +114,7 @@ def test_the_same_command_goes_on_and_another_calibration_is_not_lost(session, t
     abandon(30, 'fit', session, '--output', out, *FLAGS)
     code, _, errors, _ = act('fit', session, '--output', out, *FLAGS, '--seed', 4)
     assert code == 2
-    assert errors.splitlines()[-1].startswith(f'dlo-calibration: folder {out}: got 14 evaluations of another')
+    assert errors.splitlines()[-1].startswith(f'dlo-calibration: folder {out}: 14 evaluations of another')
     code, _, errors, toy = act('fit', session, '--output', out, *FLAGS)
     assert code == 0
     assert 'goes on after 14 evaluations of an interrupted calibration' in errors
@@ -122,8 +122,8 @@ def test_the_same_command_goes_on_and_another_calibration_is_not_lost(session, t
 
 
 @pytest.mark.parametrize('words, part', [
-    (('--seed', 4), 'option seed beside --resume: got 4, expected 3, as at the beginning; leave it out'),
-    (('--nodes', 21), 'option nodes beside --resume: got 21, expected 31'),
+    (('--seed', 4), 'option seed beside --resume: 4; expected 3, as at the beginning; leave it out'),
+    (('--nodes', 21), 'option nodes beside --resume: 21; expected 31'),
     (('--output', 'x'), 'argument --output: not allowed with argument --resume')])
 def test_other_options_are_refused_and_those_of_the_machine_are_not(words, part, session, tmp_path, act,
                                                                      abandon, capsys):
@@ -162,7 +162,7 @@ def test_a_log_that_is_no_log_is_refused_in_one_line(damage, session, tmp_path, 
     code, _, errors, _ = act('fit', '--resume', out)
     assert code == 2
     assert errors.startswith('dlo-calibration: log ')
-    assert ': got no calibration, expected a log that ' in errors
+    assert ': no calibration; expected a log that ' in errors
     assert errors.endswith(', with the options of the beginning\n')
     assert errors.count('\n') == 1
     log.write_bytes(before)
@@ -179,25 +179,25 @@ def test_without_its_first_line_the_same_command_still_uses_the_evaluations(sess
     assert 'goes on after 14 evaluations' in errors
 
 
-def test_a_folder_without_anything_and_no_session_end_with_one_line(tmp_path, act):
+def test_an_empty_folder_or_no_session_is_refused_in_one_line(tmp_path, act):
     assert act('fit', '--resume', tmp_path)[:3] == (2, '', (
-        f'dlo-calibration: folder {tmp_path}: got no interrupted calibration, expected one that fit --output '
+        f'dlo-calibration: folder {tmp_path}: no interrupted calibration; expected one that fit --output '
         'began; check the folder, or begin with fit SESSION --output\n'))
-    assert act('fit')[:3] == (2, '', 'dlo-calibration: fit: got no SESSION, expected a session or a request; '
+    assert act('fit')[:3] == (2, '', 'dlo-calibration: fit: no SESSION; expected a session or a request; '
                               'name it, or --resume DIR\n')
 
 
 def test_ctrl_c_gives_a_result_and_keeps_what_is_needed_to_go_on(session, tmp_path, act):
     whole = act('fit', session, '--output', tmp_path / 'whole', *FLAGS)
     out = tmp_path / 'out'
-    toy = Mortal(last=20, die=lambda: signal.raise_signal(signal.SIGINT))
+    toy = CountingToy(last=20, die=lambda: signal.raise_signal(signal.SIGINT))
     code, output, errors, _ = act('fit', session, '--output', out, *FLAGS, toy=toy)
     assert code == 0
     assert 'stopped on request' in output
     assert (f'it goes on with: dlo-calibration fit --resume {out}\n') in errors
     assert names(out) == FINISHED | {'unfinished'}
     assert act('fit', '--resume', out)[0] == whole[0] == 0
-    assert told(out) == told(tmp_path / 'whole')
+    assert content(out) == content(tmp_path / 'whole')
     assert names(out) == FINISHED
 
 
@@ -213,7 +213,7 @@ def test_a_request_is_resumed_from_its_copy(tmp_path, act, abandon):
 
 
 def test_what_cannot_be_simulated_leaves_nothing_to_resume(session, tmp_path, act):
-    toy = Mortal()
+    toy = CountingToy()
     toy.fail_below = 101.0
     code, _, errors, _ = act('fit', session, '--output', tmp_path / 'out', *FLAGS, toy=toy)
     assert (code, 'none of 25 evaluations could be simulated' in errors) == (2, True)

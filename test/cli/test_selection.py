@@ -8,13 +8,13 @@ import json
 import re
 import shlex
 
-from mortal import Mortal
 import pytest
-from serial import serial
+from toy_command import one_worker
 from toy_messages import MINUTE, session_messages, toy_trials
+from toy_simulator import CountingToy
 
 from dlo_calibration.cli import main as cli
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import GoalRequest, Request, TrialRequest, write_request
 from dlo_calibration.files.result import read_result
@@ -55,7 +55,7 @@ def own(tmp_path):
 def act(capsys):
     """Give a function that executes a verb: its code, output and errors."""
     def act(*words, toy=None):
-        code = cli.main(serial(words), lambda _: toy or Mortal())
+        code = cli.main(one_worker(words), lambda _: toy or CountingToy())
         return code, *capsys.readouterr()
 
     return act
@@ -114,7 +114,7 @@ def test_an_interrupted_fit_goes_on_with_the_same_trials(source, session, own, t
         raise MemoryError
 
     with pytest.raises(MemoryError):
-        act(*words, '--output', out, toy=Mortal(last=9, die=die))
+        act(*words, '--output', out, toy=CountingToy(last=9, die=die))
     code, _, errors = act('fit', '--resume', out, '--without', '1')
     assert (code, 'expected 2, as at the beginning' in errors) == (2, True)
     code, _, errors = act('fit', '--resume', out)
@@ -163,17 +163,17 @@ def test_info_names_the_topics_that_it_does_not_know_and_how_to_use_them(own, ac
 
 
 @pytest.mark.parametrize('words, part', [
-    (('--without', '4'), 'got trial 4, expected 1 to 3; see the numbers with dlo-calibration info'),
-    (('--without', '0'), 'got trial 0, expected 1 to 3'),
-    (('--without', '1,2,3'), 'got all trials, expected at least one of the 3 that stays'),
-    (('--without', 'trial'), "got 'trial', expected numbers of trials, e.g. 2,5"),
-    (('--remap', '/tracker:=goal_chain'), 'topic /tracker to read as goal_chain: got no such topic, '),
+    (('--without', '4'), 'trial 4; expected 1 to 3; see the numbers with dlo-calibration info'),
+    (('--without', '0'), 'trial 0; expected 1 to 3'),
+    (('--without', '1,2,3'), 'all trials; expected at least one of the 3 that stays'),
+    (('--without', 'trial'), "'trial'; expected numbers of trials, e.g. 2,5"),
+    (('--remap', '/tracker:=goal_chain'), 'topic /tracker to read as goal_chain: no such topic; '),
     (('--remap', '/chater:=goal_chain'), 'did you mean /chatter?'),
-    (('--remap', '/chatter:=goal_chain'), 'got a std_msgs/msg/String, expected a sensor_msgs/msg/Point'),
+    (('--remap', '/chatter:=goal_chain'), 'a std_msgs/msg/String; expected a sensor_msgs/msg/Point'),
     (('--remap', '/chatter:=goalchain'), 'did you mean goal_chain?'),
     (('--remap', '/chatter'), 'write it like /trackdlo/results_pc:=goal_chain'),
-    (('--remap', '/chatter:=action', '--remap', '/x:=action'), 'got action twice, expected each once')])
-def test_what_cannot_be_selected_is_refused(words, part, session, act):
+    (('--remap', '/chatter:=action', '--remap', '/x:=action'), 'action twice; expected each once')])
+def test_unknown_trials_and_topics_are_refused(words, part, session, act):
     code, output, errors = act('info', session, *words)
     assert (code, output, errors.count('\n')) == (2, '', 1)
     assert part in errors

@@ -6,7 +6,7 @@
 import json
 import re
 
-from calibrated import LENGTH, straight
+from made_up_dlo import LENGTH, straight
 import numpy as np
 from PIL import Image
 import pytest
@@ -15,7 +15,7 @@ from dlo_calibration import Action, Chain, Hand
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.chain_file import read_chain_file
 from dlo_calibration.files.request import Request, TrialRequest, write_request
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
 
 SAMPLES = samples()
@@ -52,10 +52,10 @@ def few_frames(monkeypatch):
     """Make small animations, as drawing one takes long."""
     monkeypatch.setattr('dlo_calibration.report.animation.DOTS_PER_INCH', 40)
     monkeypatch.setattr('dlo_calibration.report.animation.FRAME_RATE', 1)
-    monkeypatch.setattr('dlo_calibration.report.prediction_drawing.MOST_FRAMES', 4)
+    monkeypatch.setattr('dlo_calibration.report.plan_drawing.MOST_FRAMES', 4)
 
 
-def test_each_action_is_told_in_a_sentence(run, request_of):
+def test_each_action_is_described_in_a_sentence(run, request_of):
     code, output, notes = run(RESULT, request_of([
         PLACE, LiftAndHold(point=20, start=9.0), Release(start=19.0)]), '--draws', 1)
     text = ' '.join(output.split())
@@ -111,9 +111,9 @@ def test_a_recorded_session_is_simulated_where_its_hands_were(run):
 
 
 @pytest.mark.parametrize(('words', 'what'), [
-    (['--draws', '-1'], '--draws: got -1, expected 0 to 10000'),
-    (['--seed', '-1'], '--seed: got -1'),
-    (['--nodes', '1'], 'nodes: got 1'),
+    (['--draws', '-1'], '--draws: -1; expected 0 to 10000'),
+    (['--seed', '-1'], '--seed: -1'),
+    (['--nodes', '1'], 'nodes: 1'),
     (['--evaluations', '5'], 'unrecognized arguments: --evaluations'),
 ])
 def test_bad_flags_are_refused_in_one_line(run, request_of, words, what):
@@ -122,8 +122,8 @@ def test_bad_flags_are_refused_in_one_line(run, request_of, words, what):
 
 
 @pytest.mark.parametrize(('actions', 'what'), [
-    ([Drag(point=30, to=(0.1, 0.1, 0.0))], "trial 'one', action drag: got point 30, expected -21 to 20"),
-    ([Release()], "trial 'one', action release: got hand 'left_hand', which holds nothing"),
+    ([Drag(point=30, to=(0.1, 0.1, 0.0))], "trial 'one', action drag: point 30; expected -21 to 20"),
+    ([Release()], "trial 'one', action release: hand 'left_hand', which holds nothing"),
     ([Action((Hand('h', (0,), [0.0, 1e9], [[0, 0, 0], [0, 0, 1]]),))], 'divide its path'),
 ])
 def test_impossible_actions_are_refused_with_their_trial(run, request_of, actions, what):
@@ -131,7 +131,7 @@ def test_impossible_actions_are_refused_with_their_trial(run, request_of, action
     assert (code, output) == (2, '') and what in notes and notes.count('\n') == 1
 
 
-def test_input_that_is_none_is_refused_in_one_line(run, request_of, tmp_path):
+def test_a_session_without_actions_is_refused_in_one_line(run, request_of, tmp_path):
     path = request_of([PLACE])
     bad = tmp_path / 'bad.xml'
     for result, asked, what in ((tmp_path / 'no.xml', path, 'no.xml'), (path, path, '<dlo>'),
@@ -146,7 +146,7 @@ def test_input_that_is_none_is_refused_in_one_line(run, request_of, tmp_path):
     assert code == 2 and '<trial>' in notes and 'grasp_and_place' in notes
 
 
-def test_a_chain_of_another_length_is_told(run, request_of):
+def test_a_chain_of_another_length_gives_a_warning(run, request_of):
     start = Chain(straight().points * (2, 1, 1))
     code, _, notes = run(RESULT, request_of([PLACE], start=start), '--draws', 0)
     assert code == 0 and f'its chain is {2 * LENGTH:g} m long, 99 % from the 0.602 m' in notes
@@ -157,7 +157,7 @@ def test_more_points_than_a_dlo_has_are_refused(run, request_of):
     one = re.search('<point [^>]*/>', path.read_text())[0]
     path.write_text(path.read_text().replace(one, f'{one}{one}', 1))
     code, output, notes = run(RESULT, path)
-    assert (code, output) == (2, '') and 'got 1001 points, expected at most 1000; leave some' in notes
+    assert (code, output) == (2, '') and '1001 points; expected at most 1000; leave some' in notes
 
 
 def test_many_points_and_any_name(run, request_of, tmp_path, monkeypatch):
@@ -174,4 +174,4 @@ def test_without_a_screen_the_window_is_one_clear_error(run, request_of, monkeyp
     monkeypatch.delenv('DISPLAY', raising=False)
     code, output, notes = run(RESULT, request_of([PLACE]), '--draws', 0, '--gui')
     assert code == 2 and '1. grasp_and_place' in output
-    assert 'got no screen' in notes and '--output' in notes and notes.count('\n') == 1
+    assert 'no screen' in notes and '--output' in notes and notes.count('\n') == 1

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 import re
 
+from curve_views import curve, DIAMETER, drawn, view
 import numpy as np
 from PIL import Image
 import pytest
-from views import curve, DIAMETER, drawn, view
 
 from dlo_calibration.cli.main import main
 from dlo_calibration.files.chain_file import read_chain_file

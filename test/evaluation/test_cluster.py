@@ -110,7 +110,7 @@ def same(first, second):
 
 
 @pytest.mark.long
-def test_a_killed_worker_is_told_and_the_result_is_that_of_one_process(machines, capfd):
+def test_a_killed_worker_gives_a_warning_and_the_result_of_one_process(machines, capfd):
     address, processes = machines
     alone = calibrate(toy_trials(2), options(), make_simulator=new_toy)
     told = []
@@ -154,9 +154,9 @@ def test_without_workers_it_says_so_and_waits(scheduler):
     assert 'has no workers yet' in told[0]
 
 
-def test_a_machine_that_lacks_a_module_or_has_another_version_is_said_to(scheduler, start_worker, tmp_path):
+def test_a_machine_without_a_module_or_with_another_version_is_refused(scheduler, start_worker, tmp_path):
     (tmp_path / 'toy_simulator.py').touch()
-    for path, words in ((ROOT, 'a machine without the module toy_simulator, .* install'),
+    for path, words in ((ROOT, 'a machine without the module toy_simulator; .* install'),
                         (tmp_path, "another version .*'ToySimulat.* the same version everywhere")):
         worker = start_worker(PYTHONPATH=os.pathsep.join([str(path), str(ROOT)]))
         with pytest.raises(InputError, match=words):
@@ -221,7 +221,7 @@ def test_a_scheduler_that_hangs_holds_nobody_up_and_one_that_is_killed_ends_it(t
 
 @pytest.mark.parametrize('address', ['nonsense', 'tcp://', 'tcp://127.0.0.1'])
 def test_an_address_that_is_none_is_refused(address):
-    with pytest.raises(InputError, match='parameter scheduler: got .* start one with: dask scheduler'):
+    with pytest.raises(InputError, match='parameter scheduler: .* start one with: dask scheduler'):
         calibrate(toy_trials(1), options(address), make_simulator=new_toy)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from dlo_calibration.evaluation.linearisation import (
-    both_sides,
+    broyden,
+    Differences,
     information,
     Linearisation,
-    slope,
     standard_deviations,
 )
 
@@ -20,15 +20,33 @@ FIT = Linearisation(np.full(3, 0.5), JACOBIAN @ AWAY, JACOBIAN)
 
 
 def test_points_of_a_difference_stay_in_the_unit_cube():
-    beside = both_sides(np.array([0.01, 0.5, 1.0]), [0, 2], np.array([0.03, 0.1, 0.2]))
-    assert beside == pytest.approx(np.array([[0, 0.5, 1], [0.04, 0.5, 1], [0.01, 0.5, 0.8], [0.01, 0.5, 1]]))
+    sides = Differences.central(np.array([0.01, 0.5, 1.0]), [0, 2], np.array([0.03, 0.1, 0.2]))
+    assert sides.points == pytest.approx(
+        np.array([[0, 0.5, 1], [0.04, 0.5, 1], [0.01, 0.5, 0.8], [0.01, 0.5, 1]]))
 
 
 def test_a_difference_uses_the_outermost_values_that_could_be_simulated():
-    here, low, high = np.array([1.0]), np.array([0.0]), np.array([4.0])
-    assert slope((0.5, 0.4, 0.6), (here, low, high)) == pytest.approx([20])
-    assert slope((0.5, 0.4, 0.6), (here, None, high)) == pytest.approx([30])
-    assert slope((0.5, 0.5, 0.6), (here, here, None)) is None
+    sides = Differences.central(np.array([0.5]), [0], np.array([0.1]))
+    before, here, low, high = np.array([[7.0]]), np.array([1.0]), np.array([0.0]), np.array([4.0])
+    assert sides.jacobian(before, [low, high], here) == pytest.approx(np.array([[20]]))
+    assert sides.jacobian(before, [low, high]) == pytest.approx(np.array([[20]]))
+    assert sides.jacobian(before, [None, high], here) == pytest.approx(np.array([[30]]))
+
+
+def test_a_column_without_two_values_stays():
+    sides = Differences.central(np.array([0.5, 1.0]), [0], np.array([0.1, 0.1]))
+    before = np.array([[7.0, 8.0]])
+    assert np.array_equal(sides.jacobian(before, [None, np.zeros(1)]), before)
+    nowhere = Differences.one_sided(np.array([0.5, 1.0]), [1], np.zeros(2))
+    assert np.array_equal(nowhere.jacobian(before, [np.ones(1)], np.zeros(1)), before)
+
+
+def test_an_updated_jacobian_predicts_the_step_and_changes_nothing_across_it():
+    step, across = np.array([0.2, 0.1, 0.0]), np.array([-0.1, 0.2, 0.5])
+    surprise = np.linspace(-1, 1, 30)
+    updated = broyden(JACOBIAN, step, surprise)
+    assert updated @ step == pytest.approx(JACOBIAN @ step + surprise)
+    assert updated @ across == pytest.approx(JACOBIAN @ across)
 
 
 def test_the_step_leads_to_the_lowest_sum_of_squares():

@@ -16,7 +16,8 @@ from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import InputError
 from dlo_calibration.evaluation import EvaluationLog, Evaluator, Memory
-from dlo_calibration.evaluation.log import digest, Entry
+from dlo_calibration.evaluation.digest import digest
+from dlo_calibration.evaluation.log import Entry
 from dlo_calibration.model.parameters import ParameterSpace
 
 POINTS = np.random.default_rng(1).random((5, 4))
@@ -97,7 +98,7 @@ def test_a_damaged_byte_costs_one_evaluation_and_a_cut_the_last(path, evaluator)
         assert sum(map(bool, remembered(path, evaluator))) == whole[:place].count(b'\n')
 
 
-def test_after_a_cut_it_is_continued(path, evaluator):
+def test_a_cut_log_is_continued(path, evaluator):
     write(path, evaluator)
     path.write_bytes(path.read_bytes()[:-9])
     assert remembered(path, evaluator)[4] is None
@@ -125,13 +126,13 @@ def test_only_one_calibration_uses_a_log(path):
 
 
 @pytest.mark.parametrize('make', [os.mkfifo, os.mkdir, lambda path: path.symlink_to('/dev/null')])
-def test_what_is_no_file_of_its_own_is_refused_at_once(path, make):
+def test_a_log_that_is_no_regular_file_is_refused_at_once(path, make):
     make(path)
     with pytest.raises(InputError, match=r'log .*evaluations\.log'):
         EvaluationLog(path)
 
 
-def test_a_full_disk_is_told_once_and_what_was_written_remains(path, evaluator, monkeypatch):
+def test_a_full_disk_gives_one_warning_and_the_log_written_so_far_stays(path, evaluator, monkeypatch):
     told = []
     with EvaluationLog(path) as log:
         memory = Memory(log, '', told.append).of(evaluator)
@@ -151,7 +152,7 @@ def test_a_full_disk_is_told_once_and_what_was_written_remains(path, evaluator, 
 
 
 def test_digest_is_the_same_in_another_process(tmp_path):
-    program = ('from toy_messages import toy_trials\nfrom dlo_calibration.evaluation.log import digest\n'
+    program = ('from toy_messages import toy_trials\nfrom dlo_calibration.evaluation.digest import digest\n'
                'print(digest(toy_trials(2), {"b": 1.5, "a": None}))')
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, env={
         **os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), 'PYTHONHASHSEED': '7'})

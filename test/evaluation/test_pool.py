@@ -16,7 +16,7 @@ from toy_messages import toy_trials
 from toy_simulator import Stoppable, ToySimulator
 
 from dlo_calibration import EvaluationLog, SimulationError
-from dlo_calibration.evaluation import Memory, Pool, Threads
+from dlo_calibration.evaluation import BatchEvaluator, Evaluator, Memory, Pool, Threads
 from dlo_calibration.model.parameters import ParameterSpace
 
 JOBS = [(toy_trials(1)[0], ParameterSpace().physical({'flexibility': value}, 1.0))
@@ -58,7 +58,7 @@ def test_a_stop_ends_what_is_under_way_and_what_waits(workers):
         assert time.monotonic() - since < 0.2
 
 
-def test_what_was_simulated_before_is_not_simulated_again(tmp_path):
+def test_rollouts_in_memory_are_not_simulated_again(tmp_path):
     once = ToySimulator(fail_below=30.0)
     with EvaluationLog(tmp_path / 'log') as log:
         before = Pool(once, memory=Memory(log)).simulate(JOBS[:5])
@@ -67,6 +67,19 @@ def test_what_was_simulated_before_is_not_simulated_again(tmp_path):
             assert str(one) == str(other)
         with pytest.raises(RuntimeError):
             Pool(ToySimulator(crash=True), memory=Memory(log)).simulate(JOBS)
+
+
+def test_a_batch_stops_at_evaluations_that_are_in_memory_too(tmp_path):
+    evaluator = Evaluator(toy_trials(1), ParameterSpace(), ToySimulator())
+    points = np.linspace(0.2, 0.8, 5)[:, None].repeat(evaluator.space.dimension, axis=1)
+    with EvaluationLog(tmp_path / 'log') as log:
+        memory = Memory(log).of(evaluator)
+        assert len(list(BatchEvaluator(evaluator, Pool(evaluator.simulator), memory)(points, 0))) == 5
+        taken = []
+        pool = Pool(evaluator.simulator, should_stop=lambda: len(taken) == 3)
+        for evaluation in BatchEvaluator(evaluator, pool, memory)(points, 0):
+            taken.append(evaluation.index)
+        assert taken == [0, 1, 2]
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='a thread has no priority of its own')

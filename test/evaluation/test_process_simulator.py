@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 
-from far import AlwaysHanging, Deadly, Dying, far, Hanging, Slow, Telling
+from process_engines import AlwaysHanging, Deadly, Dying, Hanging, in_process, Slow, Telling
 from processes import simulating
 import pytest
 from toy_messages import toy_trials
@@ -58,7 +58,7 @@ def until(found):
 
 def test_it_gives_the_same_and_errors_pass():
     before = simulating(os.getpid())
-    with closing(far(ToySimulator, 0.0, 30.0)) as away:
+    with closing(in_process(ToySimulator, 0.0, 30.0)) as away:
         expected = tried(ToySimulator()).residuals.tobytes()
         assert [tried(away).residuals.tobytes() for _ in range(2)] == [expected, expected]
         assert tried(away, [0.1] * 4).failure == 'trial 1: diverged'
@@ -68,7 +68,7 @@ def test_it_gives_the_same_and_errors_pass():
         there = pickle.loads(pickle.dumps(away))  # noqa: S301  # as other machines get it
         assert (there.name, there._idle) == ('toy', [])
     assert simulating(os.getpid()) == before
-    with closing(far(Telling)) as away, pytest.raises(RuntimeError) as told:
+    with closing(in_process(Telling)) as away, pytest.raises(RuntimeError) as told:
         away.simulate(*a_job())
     process, nice = map(int, str(told.value).split())
     assert (process != os.getpid(), nice) == (True, min(os.nice(0) + 5, 19))
@@ -84,8 +84,8 @@ def test_pybullet_gives_there_what_it_gives_here(scene):
             assert tried(finer).residuals.tobytes() == tried(itself.refined()).residuals.tobytes()
 
 
-def test_a_crash_is_told_with_what_made_it_and_the_next_call_works(caplog):
-    with closing(far(Deadly)) as away:
+def test_a_crash_is_reported_with_the_scene_and_the_next_call_works(caplog):
+    with closing(in_process(Deadly)) as away:
         with pytest.raises(DloCalibrationError, match='the scene peg.urdf could not be simulated: '
                                                       '3 processes .* was killed by SIGKILL'):
             tried(away, LIMP)
@@ -96,12 +96,12 @@ def test_a_crash_is_told_with_what_made_it_and_the_next_call_works(caplog):
 
 
 def test_a_rollout_whose_process_dies_is_repeated(tmp_path):
-    with closing(far(Deadly, tmp_path / 'died')) as away:
+    with closing(in_process(Deadly, tmp_path / 'died')) as away:
         assert tried(away, LIMP).residuals.tobytes() == tried(ToySimulator(), LIMP).residuals.tobytes()
 
 
 def test_a_process_that_died_while_it_had_nothing_to_do_is_replaced():
-    with closing(far(ToySimulator)) as away:
+    with closing(in_process(ToySimulator)) as away:
         tried(away)
         for pid in simulating(os.getpid()):
             os.kill(pid, signal.SIGKILL)
@@ -110,17 +110,17 @@ def test_a_process_that_died_while_it_had_nothing_to_do_is_replaced():
 
 def test_a_hang_in_native_code_is_ended_and_one_that_is_slow_is_not(monkeypatch):
     monkeypatch.setattr('dlo_calibration.evaluation.process_simulator.DEATHS', 1)
-    with closing(far(Hanging, limit=1.0)) as away:
+    with closing(in_process(Hanging, limit=1.0)) as away:
         with pytest.raises(DloCalibrationError, match='gave no answer for 1 s .*; raise answer_limit'):
             tried(away, LIMP)
         assert tried(away).residuals is not None
-    with closing(far(Slow, limit=1.0)) as away:
+    with closing(in_process(Slow, limit=1.0)) as away:
         assert away.simulate(*a_job()).chains.shape == (1, 11, 3)
 
 
 def test_a_stop_ends_a_rollout_in_its_middle():
     stop = Stop()
-    with closing(far(Hanging)) as away:
+    with closing(in_process(Hanging)) as away:
         threading.Timer(0.5, stop.set).start()
         with pytest.raises(CancelledError):
             away.simulate_together([a_job(95.0)], stop)
@@ -128,7 +128,7 @@ def test_a_stop_ends_a_rollout_in_its_middle():
 
 
 def test_each_thread_has_a_process():
-    with closing(far(Slow)) as away, closing(Threads(2)) as threads:
+    with closing(in_process(Slow)) as away, closing(Threads(2)) as threads:
         begun = Pool(away, threads).begin([a_job(), a_job()])
         until(lambda: len(simulating(os.getpid())) == 2)
         first, second = begun()
@@ -163,9 +163,9 @@ def test_a_confirmation_that_crashes_or_hangs_does_no_harm(kind, limit, ending, 
 PROGRAM = """
 import sys
 sys.path[:0] = ['test/support']
-from far import far, Hanging, Slow
+from process_engines import Hanging, in_process, Slow
 from test_process_simulator import a_job
-away = far({kind}, limit={limit})
+away = in_process({kind}, limit={limit})
 print('begins', flush=True)
 away.simulate(*a_job(95.0))
 """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The flat residual vector is seen by trial, goal and point."""
+"""The residual vector by trial, goal and point; the robust loss."""
 
 import copy
 from dataclasses import replace
@@ -11,11 +11,12 @@ import pytest
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Goal
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.evaluation.residuals import (
     at_every_goal,
     compared_goals,
     compared_rows,
+    Huber,
     MOST_TIMED,
     ResidualLayout,
 )
@@ -30,7 +31,7 @@ def test_each_trial_finds_its_chains_in_the_residuals_of_an_evaluation():
     evaluator = Evaluator((first, second), ParameterSpace(), ToySimulator())
     evaluation = evaluator.evaluate(0, np.full(4, 0.3))
     chains = ResidualLayout.of((first, second)).chains(evaluation.residuals)
-    simulated = evaluator.simulate(evaluation.values)
+    simulated = [ToySimulator().simulate(*job) for job in evaluator.jobs(evaluation.point)]
     for trial, found, rollout in zip((first, second), chains, simulated, strict=True):
         observed = [goal.chain.points for goal in trial.goals]
         assert np.array_equal(found, rollout.chains - observed)
@@ -136,3 +137,23 @@ def test_points_that_were_not_seen_have_no_residuals_and_the_others_keep_theirs(
     sizes = at_every_goal(np.linalg.norm(compared.reshape(-1, 3), axis=1), some)
     assert sizes.shape == (len(thin) // 3,)
     assert np.isfinite(sizes).all()
+
+
+def test_hubers_loss_is_quadratic_then_linear():
+    loss = Huber(2.0)
+    assert loss.cost(np.array([1.0])) == 0.5
+    assert loss.cost(np.array([5.0])) == pytest.approx(2 * (5 - 1))
+    assert loss.cost(None) == np.inf
+    assert loss.roots(np.array([1.0, -8.0])) == pytest.approx([1.0, 0.5])
+    normal = np.random.default_rng(1).normal(scale=0.002, size=4000)
+    assert Huber.of(normal).threshold == pytest.approx(1.345 * 0.002, rel=0.05)
+    assert Huber.of(np.zeros(4)).threshold > 0
+
+
+def test_the_standard_deviation_is_that_of_the_residuals_without_outliers():
+    normal = np.random.default_rng(2).normal(scale=0.002, size=4000)
+    assert Huber.of(normal).deviation(normal, 4) == pytest.approx(0.002, rel=0.03)
+    spoilt = normal.copy()
+    spoilt[::100] += 0.5
+    assert Huber.of(normal).deviation(spoilt, 4) == pytest.approx(0.002, rel=0.05)
+    assert Huber.of(np.zeros(4)).deviation(np.zeros(4), 4) > 0

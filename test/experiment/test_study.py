@@ -12,13 +12,21 @@ import pytest
 from toy_messages import toy_trials, TRUTH
 from toy_simulator import ToySimulator
 
-from dlo_calibration.calibration.automatic import PAPER_ROUNDS, REFINEMENT
 from dlo_calibration.calibration.calibrate import calibrate
+from dlo_calibration.calibration.choice import PAPER_ROUNDS, REFINEMENT
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.experiment.journal import Journal
-from dlo_calibration.experiment.outcome import judged_chains, Judgement, Outcome, perform
-from dlo_calibration.experiment.study import Observed, Subject, Task, tasks
+from dlo_calibration.experiment.study import (
+    judged_chains,
+    Judgement,
+    Observed,
+    Outcome,
+    perform,
+    Study,
+    Subject,
+    Task,
+)
 from dlo_calibration.model.parameters import BY_NAME
 from dlo_calibration.model.trial import Trial
 
@@ -46,8 +54,9 @@ def test_each_search_has_a_number_of_evaluations_of_its_own():
 
 
 def test_every_run_calibrates_on_all_trials_and_without_each_that_is_held_back():
-    found = list(tasks([subject(name='a'), subject(held_back=(1,), name='b')], ['random', 'cma_es'], 2, 7,
-                       {'a': 'x', 'b': 'y'}))
+    subjects = subject(name='a'), subject(held_back=(1,), name='b')
+    study = Study(subjects, ('random', 'cma_es'), 2, 7, 1, 'a command', samples=False)
+    found = list(study.tasks({'a': 'x', 'b': 'y'}))
     assert [(one.subject.name, one.search, one.left_out) for one in found if one.seed == 7] == [
         ('a', 'random', None), ('a', 'random', 0), ('a', 'random', 1), ('a', 'random', 2),
         ('a', 'cma_es', None), ('a', 'cma_es', 0), ('a', 'cma_es', 1), ('a', 'cma_es', 2),
@@ -71,7 +80,7 @@ def test_one_calibration_finds_what_the_library_finds():
     assert done.judgements == ()
 
 
-def test_what_is_found_is_judged_by_the_trial_that_was_left_out():
+def test_the_parameters_are_judged_by_the_trial_that_was_left_out():
     one = task(left_out=1)
     done = perform(one, toy)
     judged, = done.judgements
@@ -95,7 +104,7 @@ def test_parts_that_were_found_are_simulated_where_a_trial_judges():
     assert seen[0]['stiffness_2'] == BY_NAME['stiffness_2'].physical(75.0)
 
 
-def test_what_is_judged_by_has_no_part_in_what_is_found():
+def test_the_judging_trial_does_not_change_the_parameters():
     trials = list(toy_trials(3))
     other = trials[1]
     goal = replace(other.goals[0], chain=replace(other.goals[0].chain,
@@ -116,7 +125,7 @@ def test_other_trials_judge_where_there_are_some():
     assert max(one.error for one in done.judgements) < 0.001
 
 
-def test_a_parameter_without_effect_is_told():
+def test_a_parameter_without_effect_is_not_excited():
     options = Options.of({'evaluations': 10, 'calibrate': ['flexibility', 'damping']})
     done = perform(task(options=options, search='least_squares'), toy)
     assert done.excited == ('flexibility',)
@@ -136,7 +145,7 @@ def test_a_judge_that_cannot_be_simulated_has_no_score():
     assert judged.judgements == tuple(Judgement(f'trial {k}', None, None, None) for k in (1, 2))
 
 
-def test_a_stopped_calibration_is_none():
+def test_a_stopped_calibration_has_no_outcome():
     with pytest.raises(CancelledError):
         perform(task(), toy, lambda: True)
 
@@ -167,7 +176,7 @@ def test_the_journal_gives_back_every_digit(tmp_path):
 
 @pytest.mark.parametrize('rest', ['{"key": "a", "outc', '[1]', '{"key": "a"}', '{"key": "a", "outcome": {}}',
                                   '{"key": "a", "outcome": 3}', '\0\0', 'null\n'])
-def test_lines_that_are_none_do_not_count_and_spoil_nothing(tmp_path, rest):
+def test_broken_lines_of_a_journal_are_ignored(tmp_path, rest):
     path = tmp_path / 'x'
     Journal(path, Outcome.of).add(task(), OUTCOME)
     path.write_text(path.read_text() + rest)
@@ -179,7 +188,7 @@ def test_lines_that_are_none_do_not_count_and_spoil_nothing(tmp_path, rest):
     assert [again.find(task(seed=seed)) for seed in (1, 2, 3, 4)] == [OUTCOME] * 3 + [None]
 
 
-def test_the_journal_says_what_a_line_is_of(tmp_path):
+def test_each_line_of_the_journal_names_its_task(tmp_path):
     Journal(tmp_path / 'x', Outcome.of).add(task(left_out=1, search='cma_es', seed=5), OUTCOME)
     entry = json.loads((tmp_path / 'x').read_text())
     assert (entry['object'], entry['search'], entry['seed'], entry['left_out'], entry['engine']) == (
@@ -199,8 +208,8 @@ def test_a_journal_that_cannot_be_written_says_so_and_still_knows_the_outcome(tm
 
 
 @pytest.mark.parametrize(('count', 'held_back', 'said'), [
-    (3, (3,), '--held-back: got 4, expected 1 to 3'), (3, (-1,), '--held-back: got 0'),
-    (1, (0,), 'got one trial')])
-def test_what_cannot_be_held_back_is_refused(count, held_back, said):
+    (3, (3,), '--held-back: 4; expected 1 to 3'), (3, (-1,), '--held-back: 0'),
+    (1, (0,), 'one trial')])
+def test_a_trial_that_cannot_be_held_back_is_refused(count, held_back, said):
     with pytest.raises(InputError, match=said):
         subject(count, held_back)

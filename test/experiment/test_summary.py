@@ -5,12 +5,11 @@
 
 import math
 
+from experiment_outcomes import outcomes, ROPE
 import numpy as np
-from outcomes import outcomes, ROPE
 import pytest
 
-from dlo_calibration.experiment.outcome import Outcome
-from dlo_calibration.experiment.study import Subject, Task
+from dlo_calibration.experiment.study import Outcome, Subject, Task
 from dlo_calibration.experiment.summary import Spread, summary
 
 
@@ -39,7 +38,7 @@ def test_a_default_that_is_kept_in_all_runs_does_not_scatter():
     assert math.isnan(Spread.of([1.0, math.nan]).std)
 
 
-def test_a_parameter_may_be_told_in_some_runs_only():
+def test_a_parameter_may_be_excited_in_some_runs_only():
     found = summary([*outcomes(1, 60.0, (1.0, 1.0), ('friction', 'elasticity')),
                      *outcomes(2, 70.0, (1.0, 1.0))])
     assert found.informed == {'friction': 2, 'elasticity': 1}

@@ -7,8 +7,8 @@ import csv
 from dataclasses import replace
 from io import StringIO
 
+from experiment_outcomes import outcomes
 import numpy as np
-from outcomes import outcomes
 from PIL import Image
 import pytest
 
@@ -60,7 +60,7 @@ def test_components_of_a_rest_shape_are_in_the_csv_only():
     assert {row['parameter'] for row in table(consistency_csv(account))} >= set(names)
 
 
-def test_a_parameter_that_some_runs_told_says_so():
+def test_a_table_says_in_how_many_runs_a_parameter_was_excited():
     some = replace(FINDINGS, informed={'friction': 3, 'elasticity': 1})
     average, *_ = cells(markdown(replace(ACCOUNT, findings=(some,))), 'rope')
     assert average[3] == '25 *(in 1 of 3 runs)*'
@@ -93,7 +93,7 @@ def test_the_papers_figures_stand_beside_the_samples_only():
     assert document(replace(account, samples=False))['paper'] is None
 
 
-def test_failures_and_what_is_missing_are_told():
+def test_failures_and_missing_runs_are_reported():
     failed = replace(FINDINGS, failures=4)
     text = markdown(replace(ACCOUNT, findings=(failed,), complete=False))
     assert cells(text, 'rope')[1][-1] == '4'
@@ -115,7 +115,7 @@ def test_csv_files_have_the_same_numbers():
     assert rows[1]['held_back_scores_cm'] == '10.0'
 
 
-def test_the_scatter_shows_what_was_told_in_colour(tmp_path):
+def test_the_scatter_shows_excited_parameters_in_colour(tmp_path):
     scatter_picture([DONE], tmp_path / 'a.png')
     nothing = [(task, replace(outcome, excited=())) for task, outcome in DONE]
     scatter_picture([nothing], tmp_path / 'b.png')
@@ -128,5 +128,5 @@ def test_the_scatter_shows_what_was_told_in_colour(tmp_path):
 
 
 def test_a_picture_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(InputError, match='--output'):
+    with pytest.raises(InputError, match='choose another place'):
         scatter_picture([DONE], tmp_path / 'nowhere' / 'a.png')

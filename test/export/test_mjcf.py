@@ -3,15 +3,14 @@
 
 """export_mjcf: a file that MuJoCo reads, with the stiffness, the shapes and the remarks of the DLO."""
 
-from bent import arc
-from calibrated import MadeUpDlo, straight
 from lxml import etree
+from made_up_dlo import arc, MadeUpDlo, straight
 import numpy as np
 import pytest
 
 from dlo_calibration import export_mjcf, InputError, Options, read_result
 from dlo_calibration.export import ExportedRope
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 
 NODES = Options(nodes=13)
@@ -79,7 +78,7 @@ def test_neighbours_do_not_touch():
     assert ('dlo_0', 'dlo_11') not in pairs
 
 
-def test_its_comment_says_what_was_not_found_and_what_is_lost():
+def test_its_comment_says_what_is_not_identifiable_and_what_is_lost():
     text = export_mjcf(read_result(samples() / 'xml/dlo.xml'), straight())
     assert 'elasticity is not identifiable: the trials allow 90 %: at least 5.46 N' in text
     assert 'without resistance to twist' in text
@@ -88,7 +87,7 @@ def test_its_comment_says_what_was_not_found_and_what_is_lost():
 
 
 def test_a_form_that_does_not_exist_and_too_many_nodes_are_refused():
-    with pytest.raises(InputError, match="form: got 'extendible'.*extensible"):
+    with pytest.raises(InputError, match="form: 'extendible'.*extensible"):
         export_mjcf(MadeUpDlo(), straight(), form='extendible')
     with pytest.raises(InputError, match='401.*at most 400'):
         export_mjcf(MadeUpDlo(), straight(), options=Options(nodes=401))

@@ -3,14 +3,13 @@
 
 """ExportedRope: where its nodes lie, how stiff its joints are, and what it says that was not found."""
 
-from bent import arc
-from calibrated import LENGTH, LEVEL, MadeUpDlo, straight
+from made_up_dlo import arc, LENGTH, LEVEL, MadeUpDlo, straight
 import numpy as np
 import pytest
 
 from dlo_calibration import Chain, Options, read_result
 from dlo_calibration.export import ExportedRope
-from dlo_calibration.files.samples import samples
+from dlo_calibration.files.session import samples
 from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
 
 
@@ -53,7 +52,7 @@ def test_it_rests_on_the_table_where_it_was_seen():
 
 def test_it_says_that_it_lies_higher_than_its_radius():
     raised = Chain(straight().points + (0, 0, 0.02))
-    assert any('above the table' in remark for remark in ExportedRope.of(MadeUpDlo(), raised).remarks)
+    assert any('above the table' in warning for warning in ExportedRope.of(MadeUpDlo(), raised).warnings)
     hanging = Chain(straight().points + (0, 0, 0.2))
     assert ExportedRope.of(MadeUpDlo(), hanging).table == 0.0
 
@@ -78,19 +77,19 @@ def test_its_frames_are_not_twisted():
 
 def test_it_names_what_the_trials_do_not_determine_with_its_interval():
     rope = ExportedRope.of(read_result(samples() / 'xml/dlo.xml'), straight())
-    assert [remark.split()[0] for remark in rope.remarks if 'not identifiable' in remark] == [
+    assert [warning.split()[0] for warning in rope.warnings if 'not identifiable' in warning] == [
         'elasticity', 'self_collision']
-    assert any('at least 5.46 N' in remark for remark in rope.remarks)
+    assert any('at least 5.46 N' in warning for warning in rope.warnings)
 
 
-def test_an_unknown_mass_is_said():
+def test_an_unknown_mass_gives_a_warning():
     unknown = MadeUpDlo(space=ParameterSpace(PAPER_PARAMETERS))
-    assert any('30 g are assumed' in remark for remark in ExportedRope.of(unknown, straight()).remarks)
+    assert any('30 g are assumed' in warning for warning in ExportedRope.of(unknown, straight()).warnings)
 
 
-def test_a_chain_of_another_dlo_is_doubted():
-    remarks = ExportedRope.of(MadeUpDlo(), straight(length=0.9)).remarks
-    assert any('same DLO, in metres' in remark for remark in remarks)
+def test_a_chain_of_another_length_gives_a_warning():
+    warnings = ExportedRope.of(MadeUpDlo(), straight(length=0.9)).warnings
+    assert any('same DLO, in metres' in warning for warning in warnings)
 
 
 def test_the_level_is_that_of_the_table():

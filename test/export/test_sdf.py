@@ -5,16 +5,14 @@
 
 from dataclasses import replace
 
-from bent import arc
-from calibrated import MadeUpDlo, straight
 from lxml import etree
+from made_up_dlo import arc, MadeUpDlo, straight
 import numpy as np
 import pytest
 
 from dlo_calibration import Chain, Options
 from dlo_calibration.export import export_sdf, ExportedRope
-from dlo_calibration.model.bending import rest_shape
-from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace, rest_shape
 from dlo_calibration.model.pose import Pose
 
 OPTIONS = Options(nodes=13)

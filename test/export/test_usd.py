@@ -7,15 +7,13 @@ from dataclasses import replace
 import re
 import warnings
 
-from bent import arc
-from calibrated import LENGTH, MadeUpDlo, straight
+from made_up_dlo import arc, LENGTH, MadeUpDlo, straight
 import numpy as np
 import pytest
 
 from dlo_calibration import Chain, InputError, Options
 from dlo_calibration.export import export_usd, ExportedRope
-from dlo_calibration.model.bending import rest_shape
-from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace
+from dlo_calibration.model.parameters import PAPER_PARAMETERS, ParameterSpace, rest_shape
 
 OPTIONS = Options(nodes=13)
 
@@ -122,7 +120,7 @@ def test_a_verdict_of_a_stranger_cannot_end_the_text():
 
 
 def test_another_form_is_refused():
-    with pytest.raises(InputError, match="form: got 'newton-1.5'"):
+    with pytest.raises(InputError, match="form: 'newton-1.5'"):
         text_of(MadeUpDlo(), straight(), 'newton-1.5')
 
 

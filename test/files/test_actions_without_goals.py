@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from calibrated import MadeUpDlo, straight
+from made_up_dlo import MadeUpDlo, straight
 import numpy as np
 import pytest
 from toy_messages import SECOND, toy_trials, trial_messages, write_session
@@ -51,7 +51,7 @@ def test_a_request_without_goals_is_written_and_read_but_not_fitted(tmp_path):
     found, = request_manipulations(read, Options())
     assert [step.actions for step in found.steps] == [(actions[0],), (actions[1],)]
     trials, (refusal,) = request_trials(read, Options())
-    assert trials == () and "trial 'one': got no goal chain, expected at least one" in refusal
+    assert trials == () and "trial 'one': no goal chain; expected at least one" in refusal
 
 
 def test_only_the_trials_with_a_goal_are_fitted():
@@ -68,7 +68,7 @@ def test_actions_of_different_hands_that_overlap_are_one_step():
     found = manipulation(path('left', 0.0, 2.0), path('right', 1.0, 3.0, 20), path('left', 3.0, 4.0))
     assert [[one.hands[0].name for one in step.actions] for step in found.steps] == [
         ['left', 'right'], ['left']]
-    assert found.steps[0].name == 'hand_paths' and not found.remarks
+    assert found.steps[0].name == 'hand_paths' and not found.warnings
     together = simulate(MadeUpDlo(), straight(), found.steps[:1], draws=0).steps[0].step.action
     assert {hand.name: (hand.start, hand.end) for hand in together.hands} == {
         'left': (0, 2), 'right': (1, 3)}
@@ -77,10 +77,10 @@ def test_actions_of_different_hands_that_overlap_are_one_step():
 def test_one_hand_never_acts_twice_at_once():
     found = manipulation(path('left', 0.0, 2.0), path('right', 0.0, 5.0, 20), path('left', 3.0, 4.0))
     assert [len(step.actions) for step in found.steps] == [2, 1]
-    assert 'left acts again at 3 s' in found.remarks[0]
+    assert 'left acts again at 3 s' in found.warnings[0]
     drags = [Drag(point=k, direction=(0, 1, 0), distance=0.1) for k in range(3)]
     found = manipulation(*drags)  # nobody said when they begin
-    assert [step.actions for step in found.steps] == [(drag,) for drag in drags] and not found.remarks
+    assert [step.actions for step in found.steps] == [(drag,) for drag in drags] and not found.warnings
 
 
 def test_overlapping_named_actions_have_both_names():
@@ -99,7 +99,7 @@ def test_whether_explicit_paths_hold_is_an_option(release, held_by):
     assert step.held_by == held_by
 
 
-def test_a_goal_tells_which_hands_hold():
+def test_a_goal_says_which_hands_hold():
     goals = (GoalRequest(straight(), 3.0, held_by=('left',)), GoalRequest(straight(), 9.0))
     first, second = manipulation(path('left', 0.0, 2.0), path('right', 5.0, 6.0, 20), goals=goals).steps
     assert (first.held_by, second.held_by) == (('left',), ('left',))
@@ -112,12 +112,12 @@ def test_a_hand_holds_until_it_is_released():
 
 
 def test_a_request_with_a_grip_beyond_the_chain_is_refused():
-    with pytest.raises(InputError, match=r"'one': got hand 'left' gripping points \(21,\)"):
+    with pytest.raises(InputError, match=r"'one': hand 'left' gripping points \(21,\)"):
         manipulation(Action((Hand('left', (21,), [0.0], [[0, 0, 0]]),)))
 
 
-def test_more_actions_than_anybody_waits_for_are_refused():
-    with pytest.raises(InputError, match='201 actions in turn, expected at most 200'):
+def test_too_many_actions_are_refused():
+    with pytest.raises(InputError, match='201 actions in turn; expected at most 200'):
         manipulation(*[path('left', k, k + 1) for k in range(201)])
 
 
@@ -162,7 +162,7 @@ def test_later_hands_grip_the_predicted_chain(tmp_path):
     assert [step.step.action.hands[0].grips for step in (first, second)] == [(10,), (10,)]
     assert second.chain[10, 1] == pytest.approx(0.3, abs=0.01)
     far = replace(found.steps[1].actions[0], positions=np.full((2, 1, 3), 0.5))
-    with pytest.raises(InputError, match='m from any point of the predicted chain, expected at most 0.02'):
+    with pytest.raises(InputError, match='m from any point of the predicted chain; expected at most 0.02'):
         simulate(MadeUpDlo(), found.start, [found.steps[0], replace(found.steps[1], actions=(far,))], draws=0)
 
 
@@ -181,7 +181,7 @@ def test_goals_of_a_session_change_nothing_but_who_holds(tmp_path):
             np.testing.assert_array_equal(hand.positions, again.positions)
 
 
-def test_an_action_far_from_the_first_chain_is_told_and_not_used(tmp_path):
+def test_an_action_far_from_the_first_chain_is_refused(tmp_path):
     far = Hand('left', (0,), [0.0, 1.0], [(2.0, 0, 0), (2.0, 1, 0)])
     near = Hand('left', (0,), [0.0, 1.0], [straight().points[0], (0.0, 0.1, 0.004)])
     found, (problem,) = session_manipulations(recorded(tmp_path, [
@@ -190,7 +190,7 @@ def test_an_action_far_from_the_first_chain_is_told_and_not_used(tmp_path):
     assert 'closing 1.4 m from any point' in problem
 
 
-def test_an_action_before_any_chain_is_told(tmp_path):
+def test_an_action_before_any_chain_is_refused(tmp_path):
     hand = Hand('left', (0,), [0.0, 1.0], [straight().points[0], (0.0, 0.1, 0.004)])
     found, (problem,) = session_manipulations(recorded(tmp_path, [(1, [hand])]), Options())
     assert found == () and 'no initial_chain before it' in problem

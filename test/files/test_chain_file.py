@@ -27,7 +27,7 @@ def test_a_chain_is_the_same_again(tmp_path, name):
     ('a.xml', b'0,0,0\n', 'XML'), ('a.xml', b'<dlo version="1"/>', 'point_chain'),
     ('a.xml', b'<point_chain version="1"><point x="1" y="1" z="1"/></point_chain>', 'point'),
 ])
-def test_what_is_no_chain_is_refused(tmp_path, name, octets, text):
+def test_a_file_without_a_chain_is_refused(tmp_path, name, octets, text):
     (tmp_path / name).write_bytes(octets)
     with pytest.raises(InputError) as caught:
         read_chain_file(tmp_path / name)

@@ -7,18 +7,18 @@ import argparse
 from pathlib import Path
 import re
 
-from made_up_plan import made_up_plan
+from made_up_dlo import made_up_plan
 import pytest
+from toy_planner import PlannerGraph, ToyPlan
 
-from dlo_calibration.calibration.options import declarations
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main
-from dlo_calibration.cli.options import PREFIX
-from dlo_calibration.files.intake import OUTPUT_TYPES
+from dlo_calibration.cli.arguments import PREFIX
 from dlo_calibration.files.result import read_result
-from dlo_calibration.messages.codec import bag_types
-from dlo_calibration.planning.plain import plain_plan
-from dlo_calibration.ros import planner_diagnostics, planner_session
-from dlo_calibration.ros.planner_options import PlannerOptions
+from dlo_calibration.messages.codec import OUTPUT_TYPES
+from dlo_calibration.planning.plan import plain_plan
+from dlo_calibration.ros import planner_session
+from dlo_calibration.ros.planner_session import PlannerOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,7 +36,7 @@ def sections():
 
 
 @pytest.mark.parametrize('heading, declared', [
-    ('Parameters', declarations()), ('The planner', PlannerOptions.declarations())],
+    ('Parameters', Options.declarations()), ('The planner', PlannerOptions.declarations())],
     ids=['calibrator', 'planner'])
 def test_every_parameter_is_documented_as_it_is_declared(heading, declared):
     row = re.compile(r'^\| `(\w+)` \| (.*?) \| (.*?) \| (.*?) \| (.*?) \|$', re.MULTILINE)
@@ -79,13 +79,17 @@ def test_every_verb_is_documented_with_its_own_flags():
                 assert word in f'{told[verb]}{common}', f'{verb} {word}'
 
 
-def test_every_key_of_the_planners_status_is_documented():
-    plan = made_up_plan(read_result(ROOT / 'msg_samples/xml/dlo.xml').chain)
-    status, = planner_diagnostics.planner_status(
-        bag_types(), stamp=1, state='done', detail='', missing=(), last_refusal='', description='', plans=1,
-        plan=plan).status
-    for pair in status.values:
-        assert f'`{pair.key}`' in sections()['The planner']
+def test_every_key_of_the_planners_status_is_documented(monkeypatch):
+    monkeypatch.setattr(planner_session, 'plan', ToyPlan())
+    graph = PlannerGraph()
+    try:
+        graph.send_chains()
+        keys = set(graph.planned())
+    finally:
+        graph.session.close()
+    assert {'state', 'missing', 'reached'} <= keys
+    for key in keys:
+        assert f'`{key}`' in sections()['The planner']
 
 
 def test_every_key_of_a_plan_is_documented():

@@ -4,7 +4,10 @@
 """Files of strangers: special files, too much of everything, and messages that meet a defect of ours."""
 
 import os
+import sqlite3
 import struct
+import subprocess
+import sys
 
 from mcap.writer import Writer
 import numpy as np
@@ -12,15 +15,16 @@ import pytest
 from toy_messages import SECOND, session_messages, write_session
 import zstandard
 
+from dlo_calibration import reading
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files import intake, yaml
+from dlo_calibration.files import bag
 from dlo_calibration.files import session as session_module
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.bag import AT_ONCE, unpacked
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import OUR_RECORD, SessionWriter
 from dlo_calibration.files.request import read_request
 from dlo_calibration.files.session import read_session, session_trials
-from dlo_calibration.files.unpacking import AT_ONCE, unpacked
 from dlo_calibration.messages.codec import bag_types, GOAL, INPUT_TYPES, read
 
 TYPES = bag_types()
@@ -82,11 +86,11 @@ def test_messages_of_other_topics_are_counted_not_kept(tmp_path, command):
 @pytest.mark.parametrize('name, value, words', [
     ('KEPT_MESSAGES', 4, 'more than 4 messages'), ('KEPT_OCTETS', 1500, 'topics of the calibrator'),
     ('UNPACKED_OCTETS', 1000, 'unpacks to more than'), ('MESSAGES_OF_ANY', 10, 'more than')])
-def test_what_comes_before_a_limit_is_used(tmp_path, monkeypatch, name, value, words):
+def test_messages_before_a_limit_are_used(tmp_path, monkeypatch, name, value, words):
     for limit in ('UNPACKED_RATIO', 'KEPT_OF_ANY'):
-        monkeypatch.setattr(intake, limit, 1)
-    monkeypatch.setattr(intake, 'MESSAGE_OCTETS', 10**6 if name == 'MESSAGES_OF_ANY' else 1)
-    monkeypatch.setattr(intake, name, value)
+        monkeypatch.setattr(bag, limit, 1)
+    monkeypatch.setattr(bag, 'MESSAGE_OCTETS', 10**6 if name == 'MESSAGES_OF_ANY' else 1)
+    monkeypatch.setattr(bag, name, value)
     with SessionWriter(tmp_path / 'a.mcap') as writer:
         for k in range(8):
             for kind, message in GOOD:
@@ -109,10 +113,28 @@ def test_no_more_is_unpacked_than_announced(compression):
             unpacked(packed, compression, size)
 
 
+@pytest.mark.parametrize('damaged', ['chunks', 'messages'])
+def test_damaged_content_counts_as_unpacked_too(tmp_path, monkeypatch, damaged):
+    monkeypatch.setattr(bag, 'UNPACKED_OCTETS', 10**6)
+    monkeypatch.setattr(bag, 'UNPACKED_RATIO', 1)
+    packed = zstandard.compress(bytes(10**5))
+    path = with_images(tmp_path / 'a.mcap', 0, 0)
+    head = struct.pack('<QQQII', 0, 0, 10**5, 1, 4) + b'zstd' + struct.pack('<Q', len(packed)) + packed
+    if damaged == 'messages':  # they end too early
+        message = struct.pack('<HIQQ', 1, 0, 1, 1) + packed[:-4]
+        record = struct.pack('<BQ', 5, len(message)) + message
+    else:  # their checksum differs
+        record = struct.pack('<BQ', 6, len(head)) + head
+    octets = path.read_bytes()
+    end = octets.index(b'\x0f\4\0\0\0\0\0\0\0')
+    path.write_bytes(octets[:end] + record * 20 + octets[end:])
+    assert any('unpacks to more than 1 MB' in problem for problem in read_session(path).problems)
+
+
 @pytest.mark.parametrize('make, came', [
     (os.mkfifo, 'a FIFO'), (lambda path: path.symlink_to('/dev/zero'), 'a device')])
 @pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.xml'])
-def test_what_is_no_file_is_refused_at_once(tmp_path, make, came, suffix):
+def test_a_path_that_is_no_file_is_refused_at_once(tmp_path, make, came, suffix):
     path = tmp_path / f'given{suffix}'
     make(path)
     with pytest.raises(InputError, match=came):
@@ -150,7 +172,7 @@ def test_metadata_that_is_no_rosbag2s_is_left_out(folder, text):
 
 
 def test_metadata_with_more_events_than_the_limit_is_left_out(folder, monkeypatch):
-    monkeypatch.setattr(yaml, 'MAXIMUM_EVENTS', 50)
+    monkeypatch.setattr(reading, 'MAXIMUM_EVENTS', 50)
     found = read_session(folder)
     assert len(found.messages) == len(GOOD)
     assert any('metadata.yaml cannot be read' in problem for problem in found.problems)
@@ -168,7 +190,7 @@ def test_recorded_options_that_cannot_be_read_are_left_out(tmp_path, text):
     assert 'options' in problem
 
 
-def test_undecodable_messages_are_told_once_for_each_topic(tmp_path):
+def test_undecodable_messages_give_one_warning_for_each_topic(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
         for k, (kind, message) in enumerate(GOOD):
             writer.write(f'/calibrator/{kind}', INPUT_TYPES[kind], encode(message, INPUT_TYPES[kind]), k + 1)
@@ -182,6 +204,89 @@ def test_undecodable_messages_are_told_once_for_each_topic(tmp_path):
 
 
 def test_decoded_messages_are_not_kept(folder):
-    messages = read_session(folder).messages
-    assert messages[0][1] is not messages[0][1]
-    assert len(messages[1:3]) == 2 and messages[1:3][0][0] == messages[1][0]
+    session = read_session(folder)
+    assert session.messages[0][1] is not session.messages[0][1]
+
+
+#: Two functions that take hours, each in one step of SQLite; then definitions of the messages that call them.
+ENDLESS = "instr(zeroblob(100000000), CAST(zeroblob(50000000) || x'01' AS BLOB))"
+ENDLESS_TEXT = 'instr(hex(zeroblob(60000000)), hex(zeroblob(30000000)) || 1)'
+TABLE = 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB{})'
+ROW = 'SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp'
+COMPUTED = {
+    'generated': TABLE.format(f' AS ({ENDLESS})'),
+    'text': TABLE.format(f' GENERATED ALWAYS AS ({ENDLESS_TEXT})'),
+    'stored': TABLE.format(f' AS ({ENDLESS}) STORED'),
+    'view': f'CREATE VIEW messages AS {ROW}, {ENDLESS} AS data',
+    'recursive': 'CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) '
+                 f"{ROW}, x'00' AS data FROM c",
+    'virtual': 'CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)',
+    'sorted': 'CREATE TABLE messages(rowid TEXT, topic_id INTEGER, timestamp INTEGER, data BLOB)',
+}
+
+
+def database(path, definition=None):
+    """Write a database, forge the definition of its messages, and return the page where they begin."""
+    with sqlite3.connect(path) as connection:
+        connection.executescript(f"""
+            PRAGMA page_size = 4096;
+            CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+            INSERT INTO topics VALUES (1, '/action', '{INPUT_TYPES['action']}', 'cdr');
+            {TABLE.format('')};
+            INSERT INTO messages(topic_id, timestamp) VALUES (1, 1);
+            PRAGMA writable_schema = ON""")
+        connection.execute("UPDATE sqlite_master SET sql = coalesce(?, sql) WHERE name = 'messages'",
+                           (definition,))
+        root, = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    connection.close()
+    return root
+
+
+#: Prints why each file cannot be read, or its problems.
+READ = """
+import sys
+from dlo_calibration.errors import InputError
+from dlo_calibration.files.session import read_session
+for path in sys.argv[1:]:
+    try:
+        print(read_session(path, any_topics=True).problems)
+    except InputError as error:
+        print(error)
+"""
+
+
+def read_in_time(*paths):
+    """Return a line about each file; fail where reading takes long: nothing in this process could end it."""
+    done = subprocess.run([sys.executable, '-c', READ, *paths], capture_output=True, text=True, timeout=60,
+                          env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, check=True)
+    return done.stdout.splitlines()
+
+
+def test_a_database_that_computes_its_messages_is_refused_and_evaluates_nothing(tmp_path):
+    for name, definition in COMPUTED.items():
+        database(tmp_path / f'{name}.db3', definition)
+    for text in read_in_time(*(tmp_path / f'{name}.db3' for name in COMPUTED)):
+        assert 'may compute its content' in text and 'the tables of rosbag2' in text
+
+
+def test_a_small_database_with_endless_rows_is_left_after_seconds(tmp_path):
+    path, levels, size = tmp_path / 'a.db3', 8, 4096
+    root = database(path)
+    octets = bytearray(path.read_bytes())
+    row = octets[(root - 1) * size:root * size]
+    page = len(octets) // size
+    for k in range(levels):  # each page leads 300 times to the next one, the last one to the rows
+        following = page + k + 1
+        cells = b''.join(struct.pack('>IB', following, 1) for _ in range(300))
+        head = struct.pack('>BHHHBI', 5, 0, 300, size - len(cells), 0, following)
+        places = struct.pack('>300H', *(size - len(cells) + 5 * n for n in range(300)))
+        branch = (head + places).ljust(size - len(cells), b'\0') + cells
+        if k == 0:
+            octets[(root - 1) * size:root * size] = branch
+        else:
+            octets += branch
+    octets += row
+    octets[28:32] = struct.pack('>I', len(octets) // size)
+    path.write_bytes(octets)
+    text, = read_in_time(path)
+    assert 'is not read to its end' in text

@@ -58,7 +58,7 @@ def test_a_recorded_session_holds_the_messages_as_they_came_and_the_pose(tmp_pat
     assert np.allclose(found[0].start.points, toy_trials(1)[0].initial.points, atol=1e-12)
 
 
-def test_a_request_and_the_flag(tmp_path, seen, command):
+def test_frame_pose_of_a_request_and_of_the_flag(tmp_path, seen, command):
     request = Request(tuple(map(TrialRequest.of, seen)), {'frame_pose': TEXT})
     trials, _ = request_trials(request, Options.of(request.options))
     assert_on_the_table(trials)
@@ -66,7 +66,7 @@ def test_a_request_and_the_flag(tmp_path, seen, command):
     assert np.allclose(found[1].start.points, toy_trials(2)[1].initial.points, atol=1e-12)
     write_request(tmp_path / 'request.xml', Request(request.trials))
     _, wrong, _ = command('info', tmp_path / 'request.xml', '--json')
-    assert 'got a DLO' in wrong['problems'][0]
+    assert 'a DLO' in wrong['problems'][0]
     _, right, _ = command('info', tmp_path / 'request.xml', '--json', '--frame-pose', TEXT)
     assert right['problems'] == []
     code, _, errors = command('info', tmp_path / 'request.xml', '--frame-pose', 'table')
@@ -97,6 +97,6 @@ def test_a_named_action_is_done_in_the_frame_of_the_table(action):
 
 
 @pytest.mark.parametrize('text', ['0 0 1', '0,0,1,0,0,0,1', '7seven'])
-def test_what_is_neither_a_pose_nor_a_name_is_refused(text):
+def test_a_frame_pose_that_is_neither_a_pose_nor_a_name_is_refused(text):
     with pytest.raises(InputError, match='frame_pose'):
         Options(frame_pose=text)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_examples import drawing
-from serial import serial
+from toy_command import one_worker
 from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
 
@@ -238,7 +238,7 @@ TEXT = request(LiftAndHold(point=1), PushDown(point=0, start=20.0), PATHS,
     ('<goal_chain time="60.0"', '<goal_chain time="60.0" held_by="a" colour="x"', '<goal_chain>.*colour'),
     ('stable="true"', 'stable="maybe"', '<goal_chain>.*stable.*maybe'),
 ])
-def test_what_is_wrong_is_refused_by_its_line(old, new, match):
+def test_a_wrong_element_is_refused_with_its_line(old, new, match):
     assert old in TEXT
     line = TEXT[:TEXT.index(old)].count('\n') + 1
     with pytest.raises(InputError, match=match) as caught:
@@ -249,7 +249,7 @@ def test_what_is_wrong_is_refused_by_its_line(old, new, match):
 
 
 @pytest.mark.parametrize('old, new, match', [
-    ('<waypoint time="1.0"', '<waypoint time="3.0"', '<hand>.*times do not increase'),
+    ('<waypoint time="1.0"', '<waypoint time="3.0"', '<hand>.*time 2 s of waypoint 1 after 3 s; '),
     ('grips="0 1"', 'grips="0 9"', "<trial>.*'left_hand' gripping points"),
     ('point="0"', 'point="9"', '<trial>.*push_down.*point 9.*-4 to 3'),
     ('<point x="0.6"', '<point x="0.4"', '<initial_chain>.*coincident'),
@@ -259,7 +259,7 @@ def test_what_is_wrong_is_refused_by_its_line(old, new, match):
     ('name="table" value="false"', 'name="mass" value="1"', '<settings>.*mass.*<object>'),
     ('time="60.0"', 'time="1.5"', '<trial>.*stable goal.*moves'),
 ])
-def test_what_only_the_whole_shows_is_refused_by_the_element_that_has_it(old, new, match):
+def test_contradicting_elements_are_refused_by_the_element_that_has_it(old, new, match):
     assert old in TEXT
     with pytest.raises(InputError, match=rf'^request, line \d+, element {match}'):
         request_of(TEXT.replace(old, new, 1).encode())
@@ -278,7 +278,7 @@ def test_unequal_numbers_of_points_are_refused():
     (lambda: request(LiftAndHold(point=1, hand='')), "a hand named ''"),
     (lambda: request(LiftAndHold(point=1, hand='\x00')), 'a hand named'),
     (lambda: request(goals=(GoalRequest(RAISED, 60.0, held_by=('a b',)),)), "a hand named 'a b'")])
-def test_what_cannot_be_written_is_refused_when_built(make, match):
+def test_a_request_that_cannot_be_written_is_refused_when_built(make, match):
     with pytest.raises(InputError, match=match):
         make()
 
@@ -294,7 +294,7 @@ def test_path_without_file_and_place_that_cannot_be_written_are_refused(tmp_path
 def command(capsys):
     """Give a function that returns exit code, stdout and stderr of a command with the toy."""
     def act(*words):
-        code = cli.main(serial(words), lambda options: ToySimulator())
+        code = cli.main(one_worker(words), lambda options: ToySimulator())
         return code, *capsys.readouterr()
 
     return act
@@ -356,8 +356,8 @@ def test_examples_of_the_document_are_what_it_says(tmp_path):
     described, asked, to_simulate, chain = re.findall('```xml\n(.*?)```', text, re.DOTALL)
     assert read_description(described).parameters['flexibility'].identifiable
     found = request_of(asked.encode())
-    assert {getattr(action, 'name', None) for trial in found.trials for action in trial.actions} == {
-        'lift_and_hold', 'release', None}
+    assert {action.name for trial in found.trials for action in trial.actions} == {
+        'lift_and_hold', 'release', 'hand_paths'}
     only, = request_of(to_simulate.encode()).trials
     assert [step.name for step in only.manipulation().steps] == [
         'grasp_and_place', 'lift_and_hold', 'release']
@@ -368,9 +368,9 @@ def test_examples_of_the_document_are_what_it_says(tmp_path):
 
 
 def test_samples_use_every_named_action_and_both_ways():
-    used = {getattr(action, 'name', None) for file in REQUESTS for trial in read_request(file).trials
+    used = {action.name for file in REQUESTS for trial in read_request(file).trials
             for action in trial.actions}
-    assert used == {*NAMED_ACTIONS, None}
+    assert used == {*NAMED_ACTIONS, 'hand_paths'}
 
 
 @pytest.mark.parametrize('file', REQUESTS, ids=lambda file: file.name)

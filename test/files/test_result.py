@@ -6,7 +6,7 @@
 from dataclasses import asdict, replace
 import re
 
-from fitting import fitted
+from fitted import fitted
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
@@ -17,7 +17,6 @@ from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.evaluation.evaluator import Evaluator
 from dlo_calibration.files.result import (
     Description,
     description_document,
@@ -27,7 +26,7 @@ from dlo_calibration.files.result import (
 )
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.search.sampling import RandomSearch
 
 OPTIONS = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction', 'flexibility'], 'damping': 1 / 3})
 TRUTH = {'flexibility': 41.0, 'elasticity': 30.0, 'friction': 62.0, 'self_collision': 20.0}
@@ -80,10 +79,10 @@ def test_value_of_a_found_parameter_in_the_options_does_not_count(tmp_path):
 
 def test_same_simulation_bit_for_bit(file, result):
     found = read_result(file)
-    rollouts = Evaluator(result.trials, found.space, ToySimulator()).simulate(found.values)
-    for rollout, goals, trial in zip(rollouts, result.chains, result.trials, strict=True):
+    for goals, trial in zip(result.chains, result.trials, strict=True):
+        rollout = ToySimulator().simulate(trial, found.physical())
         np.testing.assert_allclose(rollout.chains, goals, atol=1e-12)
-        first, = Evaluator([trial], result.space, ToySimulator()).simulate(result.values)
+        first = ToySimulator().simulate(trial, result.physical())
         np.testing.assert_array_equal(rollout.chains, first.chains)
 
 
@@ -131,7 +130,7 @@ def test_a_document_from_before_there_were_correlations_stays_as_it_is(file):
 def test_a_missing_pair_is_refused(file):
     text = re.sub('<correlation .*/>', '', file.read_text(encoding='utf-8'))
     file.write_text(text, encoding='utf-8')
-    refused(file, '<correlations>.*0 correlations, expected 1, one for each pair')
+    refused(file, '<correlations>.*0 correlations; expected 1, one for each pair')
 
 
 def test_document_is_for_people_too(file):
@@ -141,11 +140,11 @@ def test_document_is_for_people_too(file):
 
 
 def test_a_result_that_should_not_be_used_says_so_wherever_it_is_read(tmp_path, result):
-    doubted = replace(result, doubts=('trial 1: got a DLO on the Moon',))
+    doubted = replace(result, implausible=('trial 1: a DLO on the Moon',))
     write_result(tmp_path / 'doubted.xml', doubted, OPTIONS.flat())
     found = read_result(tmp_path / 'doubted.xml')
-    assert found.unusable == doubted.unusable == doubted.doubts[0]
-    assert found.problems == (f'do not use this result: {doubted.doubts[0]}',)
+    assert found.unusable == doubted.unusable == doubted.implausible[0]
+    assert found.problems == (f'do not use this result: {doubted.implausible[0]}',)
     sound = Description.of(replace(result, choice=None))
     assert sound.unusable == ''
     assert read_description(description_document(sound)).problems == ()
@@ -221,7 +220,7 @@ def test_a_correlation_is_a_cosine(file):
     (('<warnings/>', ''), '<calibration>.*Missing.*warnings'),
     (('name="seed" value="1"', 'name="evaluations" value="1"'), '<option>.*evaluations.*twice'),
 ])
-def test_what_only_the_whole_shows_is_refused(file, change, match):
+def test_contradicting_elements_are_refused(file, change, match):
     text = file.read_text(encoding='utf-8')
     assert change[0] in text
     file.write_text(text.replace(*change, 1), encoding='utf-8')

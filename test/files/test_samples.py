@@ -8,7 +8,7 @@ import itertools
 import json
 from pathlib import Path
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
@@ -24,8 +24,8 @@ from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import ACTION, bag_types, INPUT_TYPES, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.planning.checks import checked
 from dlo_calibration.planning.options import PlanOptions
+from dlo_calibration.planning.planner import checked
 from dlo_calibration.search import RandomSearch
 from dlo_calibration.simulation.bullet import BulletSimulator
 

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
@@ -26,7 +26,7 @@ from ruamel.yaml import YAML
 
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import RecordingError, SessionWriter
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import (
@@ -96,7 +96,7 @@ def session(tmp_path_factory):
     """Give the folder of a session of three trials and a status, with options."""
     with SessionWriter(tmp_path_factory.mktemp('out') / 'session', {'mass': 0.03}) as writer:
         write(writer)
-        said = status(TYPES, stamp=START, state='done', trials=3)
+        said = status(TYPES, START, {'state': 'done', 'trials': 3, 'detail': ''}, None)
         writer.write('/calibrator/status', STATUS, encode(said, STATUS), MESSAGES[-1][2])
     return writer.path
 
@@ -316,6 +316,7 @@ def test_cut_anywhere_gives_the_messages_before_the_cut(whole_file, tmp_path_fac
 
 @drawing(15)
 @given(place=st.floats(0, 1), octets=st.binary(min_size=1, max_size=9))
+@example(place=0.125, octets=b'\0')  # in the definitions of a database
 def test_damaged_anywhere_is_read_or_refused(whole_file, tmp_path_factory, place, octets):
     damaged, suffix = bytearray(whole_file[0]), whole_file[1]
     at = int(place * (len(damaged) - len(octets)))
@@ -356,7 +357,7 @@ def test_cut_session_says_so(tmp_path, session):
         'rosbag2_bagfile_information: {relative_file_paths: [gone.mcap]}')),
     lambda path: (path.mkdir(), (path / 'a.db3').write_text('no database')),
 ], ids=['nothing', 'empty folder', 'text', 'empty file', 'recording gone', 'no database'])
-def test_what_is_no_session_is_refused(tmp_path, make):
+def test_a_path_that_is_no_session_is_refused(tmp_path, make):
     make(tmp_path / 'given')
     assert read_or_refuse(tmp_path / 'given') is None
 
@@ -422,7 +423,7 @@ def test_topic_of_another_type_is_left_out_and_named(tmp_path):
 # Options and marks
 
 
-def test_all_options_come_back_and_the_last_ones_count(tmp_path):
+def test_the_last_recorded_options_are_read(tmp_path):
     options = Options.of({'mass': 0.1 + 0.2, 'calibrate': ['friction'], 'table': False, 'damping': 12.5})
     with SessionWriter(tmp_path / 'session', Options().flat()) as writer:
         write(writer)
@@ -430,7 +431,7 @@ def test_all_options_come_back_and_the_last_ones_count(tmp_path):
     assert read_session(writer.path).options == options
 
 
-def test_replay_stands_on_what_the_calibration_stood_on(tmp_path):
+def test_a_replay_uses_the_messages_of_the_calibration(tmp_path):
     with SessionWriter(tmp_path / 'session') as writer:
         write(writer, MESSAGES[:3])
         writer.write_mark('reset')

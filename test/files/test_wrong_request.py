@@ -12,7 +12,7 @@ import sys
 
 from hypothesis import given, HealthCheck
 from hypothesis import strategies as st
-from live import live_node, LOG_WARN, QUICK, robot_types
+from live_node import live_node, LOG_WARN, QUICK, robot_types
 import pytest
 from random_examples import drawing
 from toy_messages import session_messages, write_session
@@ -46,12 +46,12 @@ def test_goals_without_initial_chain_wait_visibly_and_are_refused_once_when_one_
         robot.until(lambda: robot.status['incomplete'].startswith(wanted))
         answer = robot.call('start')
         assert not answer.success
-        assert answer.message == ('~/start: got no complete trial, expected an initial_chain before action '
+        assert answer.message == ('~/start: no complete trial; expected an initial_chain before action '
                                   'stamped 60 s; send it, then call ~/start again')
         robot.send(session_messages(types, 1, first=1))
         robot.until_status(trials='1', incomplete='')
         refusal = robot.status['last_refusal']
-        for word in ('action stamped 60 s and 1 more', 'got no initial_chain before them',
+        for word in ('action stamped 60 s and 1 more', 'no initial_chain before them',
                      'expected one stamped earlier (the first is initial_chain stamped 120 s)',
                      'stamp all messages with one clock'):
             assert word in refusal
@@ -67,11 +67,11 @@ def test_goals_without_initial_chain_in_a_file(tmp_path, command):
     code, about, errors = command('info', path, '--json')
     refusal, = about['refusals']
     assert (code, errors) == (0, [])
-    for word in ('action stamped 60 s and 1 more', 'got no initial_chain before them', 'there is none'):
+    for word in ('action stamped 60 s and 1 more', 'no initial_chain before them', 'there is none'):
         assert word in refusal
     code, result, errors = command('fit', path, '--json')
     assert (code, result, errors[0]) == (2, None, refusal)
-    assert 'got no complete trial, expected an initial_chain, an action and a goal_chain' in errors[1]
+    assert 'no complete trial; expected an initial_chain, an action and a goal_chain' in errors[1]
     assert len(errors) == 2
     path = write_session(tmp_path / 'followed.mcap', [*orphans, *session_messages(FILES, 1, first=1)], QUICK)
     code, result, errors = command('fit', path, '--json')
@@ -80,12 +80,12 @@ def test_goals_without_initial_chain_in_a_file(tmp_path, command):
     assert 'the first is initial_chain stamped 120 s' in refusal
 
 
-def test_start_without_trials_is_refused_at_both_doors(ros_environment, tmp_path, command):
+def test_start_without_trials_is_refused_by_node_and_command(ros_environment, tmp_path, command):
     with live_node(ros_environment, tmp_path / 'out') as robot:
         answer = robot.call('start')
         assert not answer.success
         assert answer.message == (
-            '~/start: got no complete trial, expected an initial_chain, an action and a goal_chain; '
+            '~/start: no complete trial; expected an initial_chain, an action and a goal_chain; '
             'send it, then call ~/start again')
         robot.until_status(last_refusal=answer.message, state='collecting')
         robot.until(lambda: [log.msg for log in robot.heard['log'] if log.level >= LOG_WARN]
@@ -109,7 +109,7 @@ def test_requests_at_the_wrong_time_are_refused_once(ros_environment, tmp_path):
         def refused(name, came, remedy, again=''):
             answer = robot.call(name)
             assert not answer.success
-            for word in (f'~/{name}: got {came}, expected ', remedy):
+            for word in (f'~/{name}: {came}; expected ', remedy):
                 assert word in answer.message
             robot.until_status(last_refusal=answer.message + again)
             expected.append(answer.message + again)
@@ -158,7 +158,7 @@ def test_node_survives_mutated_bytes_and_calibrates_good_trials(ros_environment,
 
 def whole_result(robot):
     """Return what the result says of the calibration as a whole."""
-    from graph import whole
+    from ros_robot import whole
 
     return whole(robot.until_result())
 
@@ -181,7 +181,8 @@ class FullDisk:
 
 @pytest.mark.parametrize('room', [
     0, 1500, 12000, *(pytest.param(room, marks=pytest.mark.long) for room in (100, 3000, 8000))])
-def test_full_disk_is_told_once_and_the_calibration_goes_on(ros_environment, tmp_path, monkeypatch, room):
+def test_a_full_disk_gives_one_warning_and_the_calibration_goes_on(ros_environment, tmp_path, monkeypatch,
+                                                                   room):
     create = recording._create
 
     def on_full_disk(path):
@@ -220,7 +221,7 @@ def closed_folder(path):
 
 
 @pytest.mark.parametrize('make', [no_folder, closed_folder])
-def test_folder_that_cannot_be_written_is_told_once_and_the_calibration_goes_on(
+def test_a_folder_that_cannot_be_written_gives_one_warning_and_the_calibration_goes_on(
         ros_environment, tmp_path, make):
     make(tmp_path / 'out')
     with live_node(ros_environment, tmp_path / 'out') as robot:
@@ -229,10 +230,10 @@ def test_folder_that_cannot_be_written_is_told_once_and_the_calibration_goes_on(
         robot.until_status(trials='1')
         assert robot.call('start').success
         robot.until_result()
-        assert 'expected a place that can be written to' in robot.status['last_refusal']
+        assert 'choose another place' in robot.status['last_refusal']
 
 
-def test_folder_that_goes_away_is_told_and_the_calibration_goes_on(ros_environment, tmp_path):
+def test_a_folder_that_goes_away_gives_a_warning_and_the_calibration_goes_on(ros_environment, tmp_path):
     with live_node(ros_environment, tmp_path) as robot:
         robot.send(session_messages(robot_types(), 1))
         robot.until_status(trials='1')
@@ -313,12 +314,12 @@ def test_killed_at_any_moment_a_session_reads_up_to_its_last_complete_message(tm
 
 
 @pytest.mark.long
-def test_node_killed_while_it_records_loses_nothing_that_it_told(ros_environment, tmp_path, command):
-    import graph
+def test_a_node_killed_while_it_records_loses_no_trial_of_its_status(ros_environment, tmp_path, command):
+    import ros_robot
 
-    pairs = session_messages(graph.TYPES, 8)
-    with graph.child(ros_environment, tmp_path / 'out') as process, \
-            graph.robot_of(ros_environment) as robot:
+    pairs = session_messages(ros_robot.TYPES, 8)
+    with ros_robot.child(ros_environment, tmp_path / 'out') as process, \
+            ros_robot.robot_of(ros_environment) as robot:
         robot.matched()
         for k, pair in enumerate(pairs):
             robot.send([pair])
@@ -328,10 +329,10 @@ def test_node_killed_while_it_records_loses_nothing_that_it_told(ros_environment
         robot.until(lambda: robot.status['incomplete'] or robot.status['trials'] != '0')
         process.kill()
         process.wait()
-        told = [graph.values(message.status[0]) for message in robot.heard['status']]
+        told = [ros_robot.values(message.status[0]) for message in robot.heard['status']]
     folder, = (tmp_path / 'out').glob('dlo_session_*')
     session = read_session(folder)
-    recorded = [graph.values(message.status[0]) for message in session.outputs('status')]
+    recorded = [ros_robot.values(message.status[0]) for message in session.outputs('status')]
     assert told and all(one in recorded for one in told)
     trials, _ = session_trials(session, Options())
     assert len(trials) >= int(told[-1]['trials'])

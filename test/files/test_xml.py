@@ -6,6 +6,7 @@
 from contextlib import closing
 import socket
 import threading
+import time
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -65,8 +66,8 @@ def test_external_entity_is_refused_and_not_read(tmp_path):
     f'<!DOCTYPE {NAMED} PUBLIC "-//X//Y" "http://127.0.0.1:9/some.dtd">',
     f'<!DOCTYPE {NAMED} [<!ATTLIST trial name CDATA "x">]>', '<!DOCTYPE\n x>'])
 def test_document_type_is_refused_by_its_line(doctype):
-    refused(f'{HEAD}\n\n{doctype}\n{BODY.replace(">", " >")}', 'line 3: got a document type declaration')
-    refused(f'{HEAD}\n\n{doctype}\n{BODY}'.replace('"rope"', '"&e;"'), 'line 3: got a document type')
+    refused(f'{HEAD}\n\n{doctype}\n{BODY.replace(">", " >")}', 'line 3: a document type declaration')
+    refused(f'{HEAD}\n\n{doctype}\n{BODY}'.replace('"rope"', '"&e;"'), 'line 3: a document type')
 
 
 @pytest.mark.parametrize('attribute', [False, True])
@@ -90,7 +91,7 @@ def test_other_encodings_are_refused_or_read_as_utf_8(encoding):
 
 
 def test_bytes_that_are_no_text_are_refused_by_their_line():
-    refused(TEXT.encode().replace(b'rope', b'r\xffpe'), 'line 3: got bytes that are not UTF-8')
+    refused(TEXT.encode().replace(b'rope', b'r\xffpe'), 'line 3: bytes that are not UTF-8')
 
 
 @pytest.mark.parametrize('insert', [
@@ -154,7 +155,7 @@ def test_many_attributes_are_refused():
 
 @pytest.mark.parametrize('octets', [b'', b'<', b'no xml', b'\xff\xfe\0', b'<robot/>', f'<{NAMED}/>'.encode(),
                                     b'\0' * 100, b'<a></b>', b'<a/><a/>', b'<a b="1" b="2"/>', b'<a>'])
-def test_what_is_no_document_is_refused(octets):
+def test_a_file_that_is_no_document_is_refused(octets):
     refused(octets)
 
 
@@ -189,3 +190,12 @@ def test_written_form_does_not_depend_on_how_it_was_indented():
     root = etree.fromstring(TEXT.encode())
     flat = etree.tostring(root).replace(b'\n', b'').replace(b'  ', b'')
     assert request_of(flat).document == TEXT.encode()
+
+
+@pytest.mark.parametrize('trials', [
+    '<trial/>' * 200_000, '<trial {}/>'.format(' '.join(f'a{k}="1"' for k in range(10**5)))],
+    ids=['elements', 'attributes'])
+def test_a_document_in_which_very_much_is_wrong_is_refused_within_seconds(trials):
+    begun = time.monotonic()
+    refused(f'<calibration_request version="1"><object/><settings/>{trials}</calibration_request>', '<trial>')
+    assert time.monotonic() - begun < 20

@@ -6,10 +6,10 @@
 from concurrent.futures import CancelledError
 from dataclasses import replace
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
-from remembering import remembering_result
+from rest_shape_result import rest_shape_result
 from toy_simulator import toy_trial, ToySimulator
 
 from dlo_calibration import Chain, Goal, SimulationError, Trial
@@ -67,7 +67,7 @@ def advice_for(simulator, result, **rest):
                   result.examination.uncertainty, result.length)
 
 
-def test_the_only_action_that_tells_about_a_parameter_is_advised():
+def test_the_only_action_that_informs_about_a_parameter_is_advised():
     simulator = Telling('drag the middle')
     result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert result.parameters['friction'].verdict == 'not identifiable'
@@ -91,13 +91,13 @@ def test_the_expected_deviation_is_what_a_calibration_with_that_trial_gives():
     assert advice.expected_std == pytest.approx(friction.std / 100, rel=0.6)
 
 
-def test_nothing_is_advised_where_nothing_helps():
+def test_nothing_is_advised_if_no_action_helps():
     simulator = Telling('no such action')
     result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert advice_for(simulator, result) is None
 
 
-def test_nothing_is_advised_and_simulated_where_all_is_known():
+def test_nothing_is_simulated_and_advised_if_all_parameters_are_identifiable():
     simulator = Telling('')
     result = found(simulator, observed('trial 1'), observed('trial 2', seed=1))
     assert {one.verdict for one in result.parameters.values()} == {'identifiable'}
@@ -106,7 +106,7 @@ def test_nothing_is_advised_and_simulated_where_all_is_known():
     assert simulator.names == []
 
 
-def test_the_action_that_tells_most_is_advised():
+def test_the_most_informative_action_is_advised():
     class Better(Telling):
         def simulate(self, trial, physical):
             self.worth = 0.3 if 'middle' in trial.name else 1.0
@@ -127,9 +127,9 @@ def test_few_rollouts_are_spent():
     assert len(simulator.names) <= 2 * count + 6
 
 
-def test_of_many_parameters_the_least_certain_are_sought():
+def test_advice_is_sought_for_the_least_certain_of_many_parameters():
     """The toy shows four of thirty parameters, which are the most certain ones."""
-    result = remembering_result()
+    result = rest_shape_result()
     unsure = replace(result.examination.uncertainty, std=np.where(np.arange(30) < 4, 0.15, 0.2))
     simulator = Telling('')
     assert advise(result.trials, result.space, Pool(simulator), result.best.point, unsure,

@@ -6,28 +6,29 @@
 from dataclasses import replace
 import json
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
-from serial import serial
+from toy_command import one_worker
 from toy_messages import session_messages, toy_trials, TRUTH, write_session
 from toy_simulator import Stoppable, ToySimulator
 
 from dlo_calibration import calibrate, SimulationError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.plain import plain
+from dlo_calibration.calibration.result import plain
 from dlo_calibration.calibration.stages import confirmed, confirming
 from dlo_calibration.cli import main as cli
 from dlo_calibration.files.result import read_result, write_result
-from dlo_calibration.inference.confirmation import disagreements
+from dlo_calibration.inference.examination import disagreements
 from dlo_calibration.messages.codec import bag_types
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.score import PointErrors, residuals, TrialScore
-from dlo_calibration.report.page import Origin, write_report
-from dlo_calibration.report.rows import fit_facts
+from dlo_calibration.report.page import Origin, page_of
+from dlo_calibration.report.sentences import fit_facts
 from dlo_calibration.ros import diagnostics
-from dlo_calibration.search.random import RandomSearch
+from dlo_calibration.search.sampling import RandomSearch
 from dlo_calibration.simulation.protocol import Rollout
+from dlo_calibration.writing import write_file
 
 OPTIONS = Options(evaluations=20, workers=1)
 
@@ -77,7 +78,7 @@ def test_the_result_stays_and_the_other_engines_figures_stand_beside_it():
     assert other.errors.mean == pytest.approx(PointErrors.of(residual).mean)
 
 
-def test_it_is_simulated_while_other_stages_go_on():
+def test_a_confirmation_runs_beside_other_stages():
     before, expected = found(SecondToy(0.004))
     with confirming(before, SecondToy(0.004)) as confirm:
         after = confirm(replace(before, warnings=('of another stage',)))
@@ -91,7 +92,7 @@ def test_nothing_is_simulated_where_there_is_nothing_to_confirm():
         assert confirmed(before, options, engines(second)) == before
 
 
-def test_it_costs_no_evaluation():
+def test_a_confirmation_costs_no_evaluation():
     before, after = found(SecondToy())
     assert after.simulations == before.simulations
 
@@ -117,7 +118,7 @@ def test_a_disagreement_names_the_trial_and_how_much():
     (0.0004, 1.0, 1.0, False), (0.0006, 1.0, 1.0, True),
     (0.0, 1.0, 1.09, False), (0.0, 1.0, 1.11, True), (0.0, 1.11, 1.0, True),
     (0.0, 10.0, 10.4, False), (0.0, 10.0, 10.6, True)])
-def test_tolerances(shift, score, other, tells):
+def test_only_differences_beyond_the_tolerances_are_reported(shift, score, other, tells):
     chain = np.zeros((1, 5, 3))
     assert bool(disagreements(['a'], [chain], [chain + (shift, 0, 0)], [score], [other])) is tells
 
@@ -198,14 +199,14 @@ def command(capsys, tmp_path):
     def act(verb, *words):
         capsys.readouterr()
         before = (tmp_path / 'out/result.xml',) if verb == 'validate' else ()
-        assert cli.main(serial((verb, *before, session, '--json', *words)),
+        assert cli.main(one_worker((verb, *before, session, '--json', *words)),
                         engines(SecondToy(0.004))) == 0
         return json.loads(capsys.readouterr().out)
     return act
 
 
 @pytest.mark.long
-def test_fit_and_validate_tell_both_engines(command, tmp_path):
+def test_fit_and_validate_print_both_engines(command, tmp_path):
     fitted = command('fit', '--output', tmp_path / 'out')
     checked = command('validate')
     for document in (fitted, checked):
@@ -222,12 +223,12 @@ def test_fit_and_validate_tell_both_engines(command, tmp_path):
     assert command('fit', '--engine', 'compiled')['confirmation'] is None
 
 
-def test_people_are_told(tmp_path):
+def test_sentences_name_the_confirmation(tmp_path):
     before, after = found(SecondToy(0.004))
     assert dict(fit_facts(plain(after)))['confirmed by second toy'].endswith(
         'points 4 mm from those of toy, 4 mm at most')
     assert 'confirmed by second toy' not in dict(fit_facts(plain(before)))
-    write_report(tmp_path / 'report.html', after, Origin('session', 'fit', Options()))
+    write_file(tmp_path / 'report.html', page_of(after, Origin('session', 'fit', Options())))
     assert 'confirmed by second toy' in (tmp_path / 'report.html').read_text(encoding='utf-8')
 
 

@@ -152,7 +152,7 @@ def test_a_finer_simulation_widens_what_it_moves():
     assert len(finer.asked) == 1
 
 
-def test_a_finer_simulation_that_fails_leaves_nothing_known():
+def test_if_the_finer_simulation_fails_nothing_is_identifiable():
     found = examined(noisy_model(), finer=lambda points: [None])
     assert found.uncertainty.verdicts == ('not identifiable', 'not identifiable')
 

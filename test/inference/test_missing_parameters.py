@@ -5,12 +5,12 @@
 
 from dataclasses import replace
 
-from carried import EVEN, observed, STIFF_MIDDLE, TRUTH
-from fitting import fitted
+from carried_trials import EVEN, observed, STIFF_MIDDLE, TRUTH
+from fitted import fitted
 import pytest
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.plain import plain
+from dlo_calibration.calibration.result import plain
 from dlo_calibration.calibration.setting import Setting
 from dlo_calibration.calibration.stages import with_missing_parameters
 from dlo_calibration.inference.missing_parameters import _candidates, PARTS
@@ -32,7 +32,7 @@ def candidates(space):
 
 @pytest.mark.parametrize('name, value', [
     ('natural_curvature', 15.0), pytest.param('bending_friction', 45.0, marks=pytest.mark.long)])
-def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
+def test_a_parameter_that_was_fixed_at_a_wrong_value_is_named(name, value):
     result = found(observed(ParameterSpace((*EVEN.free, name)), {**TRUTH, name: value}))
     assert result.missing_parameters[0].name == name
     assert result.missing_parameters[0].share > 0.15
@@ -42,7 +42,7 @@ def test_it_names_the_parameter_that_was_held_where_it_was_not(name, value):
 
 
 @pytest.mark.long
-def test_it_names_parts_of_different_stiffness():
+def test_parts_of_different_stiffness_are_named():
     result = found(observed(EVEN.divided(4), STIFF_MIDDLE))
     assert result.missing_parameters[0].name == PARTS
     assert result.missing_parameters[0].share > 0.15
@@ -55,7 +55,7 @@ def test_where_only_noise_is_left_there_is_nothing_to_explain():
     assert plain(result)['explanations'] == {}
 
 
-def test_nothing_is_named_that_would_not_help():
+def test_a_parameter_that_would_not_help_is_not_named():
     # Points that are all off by a centimetre, whatever the DLO is made of.
     trials = [replace(trial, goals=tuple(
         replace(goal, chain=replace(goal.chain, points=goal.chain.points + 0.01 * (-1)**k))
@@ -65,7 +65,7 @@ def test_nothing_is_named_that_would_not_help():
     assert result.missing_parameters == ()
 
 
-def test_what_has_no_effect_of_its_own_is_not_simulated():
+def test_a_parameter_without_effect_of_its_own_is_not_simulated():
     space = ParameterSpace(('flexibility',), {'bending_friction': 0.0})
     assert 'bending_slip' not in candidates(space) and 'bending_friction' in candidates(space)
     assert 'bending_slip' in candidates(ParameterSpace(('flexibility', 'bending_friction')))

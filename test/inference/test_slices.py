@@ -13,7 +13,7 @@ from toy_simulator import new_toy, ToySimulator
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.inference.slices import (
     chosen,
     LEVELS,
@@ -87,7 +87,7 @@ def test_pair_that_depends_on_each_other_most_comes_first(result):
     assert pairs(4, examination) == expected
 
 
-def test_what_takes_too_long_is_left_out(result):
+def test_slices_that_take_too_long_are_left_out(result):
     now = iter(np.arange(10000.0))
     slices = around(result, seconds=40, clock=lambda: next(now))
     assert not slices.complete
@@ -97,14 +97,14 @@ def test_what_takes_too_long_is_left_out(result):
     assert (nothing.lines, nothing.planes, nothing.evaluations, nothing.complete) == ((), (), 0, False)
 
 
-def test_failures_are_infinite(result):
+def test_failed_points_of_a_slice_are_infinite(result):
     slices = around(result, ToySimulator(fail_below=result.values['flexibility'] - 1.0))
     line = slices.lines[0]
     assert math.isinf(line.errors[0]) and math.isinf(line.scores[0])
     assert np.isfinite(line.errors[-1])
 
 
-def test_is_the_same_each_time(result):
+def test_slices_are_the_same_each_time(result):
     one, two = (around(result) for _ in range(2))
     assert all(np.array_equal(a.errors, b.errors) for a, b in zip(one.lines, two.lines, strict=True))
     assert one.evaluations == two.evaluations

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
 from toy_simulator import toy_trial, ToySimulator
@@ -76,7 +76,7 @@ def calibrated(simulator, *names):
     return fitted(trials, SPACE, simulator, SEARCHES['least_squares'](2, 1), budget=80)
 
 
-def test_a_result_says_what_each_trial_told_alone():
+def test_a_result_knows_the_standard_deviations_of_each_trial_alone():
     result = calibrated(Blind(), 'trial 1', 'trial 2')
     alone = std_of_each_alone(result.trials, result.examination)
     assert alone.shape == (2, 2)
@@ -85,7 +85,7 @@ def test_a_result_says_what_each_trial_told_alone():
     assert uninformative(result.trials, result.examination) == ()
 
 
-def test_a_trial_that_told_nothing_is_named():
+def test_an_uninformative_trial_is_named():
     class Deaf(ToySimulator):
         def simulate(self, trial, physical):
             if trial.name == 'idle':

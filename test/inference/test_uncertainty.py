@@ -60,7 +60,7 @@ def test_the_verdict_is_the_width_of_the_interval_and_a_bound_is_weak_at_best(lo
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_the_bounds_contain_the_best_and_what_made_the_good_ones_good(seed):
+def test_the_interval_contains_the_best_and_all_good_evaluations(seed):
     best, found = spread(tried(150, seed))
     assert (found.lower <= best).all()
     assert (best <= found.upper).all()
@@ -165,7 +165,7 @@ def repeated(residuals, trials=4):
     return Linearisation(POINT, residuals.ravel(), np.tile(jacobian, (trials, 1)))
 
 
-def test_a_trial_that_is_repeated_to_the_digit_counts_once():
+def test_an_exact_repeat_of_a_trial_counts_once():
     once = np.random.default_rng(11).normal(0, 1e-3, (1, 120))
     moved = np.random.default_rng(12).normal(0, 1e-3, (3, 1, 120))
     single, fourfold = (

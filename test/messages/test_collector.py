@@ -3,6 +3,7 @@
 
 """Trials follow from the stamps of the messages, not from the order of their arrival."""
 
+from collections import Counter
 from dataclasses import replace
 
 from hypothesis import given
@@ -15,6 +16,7 @@ from trial_contents import anew, contents
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.errors import InputError
 from dlo_calibration.messages import collector as module
+from dlo_calibration.messages import trial_builder
 from dlo_calibration.messages.codec import ActionMessage, ChainMessage, GOAL, INITIAL
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.chain import Chain
@@ -72,7 +74,7 @@ def refused(collector, message):
         collector.add(message)
     assert contents(collector.trials) == before
     text = str(caught.value)
-    assert text.startswith(f'{message}: got ')
+    assert text.startswith(f'{message}: ')
     return text
 
 
@@ -177,7 +179,7 @@ FIRST, SECOND = (initial(1), action(2), goal(5)), (initial(11), action(12), goal
 
 
 @pytest.mark.parametrize('count', range(2, 4))
-def test_the_newest_trial_is_taken_back_complete_or_not_and_what_a_tracker_sends_of_it(count):
+def test_the_newest_trial_is_discarded_complete_or_not_with_later_messages_of_a_tracker(count):
     collector = collect(*FIRST, *SECOND[:count])
     assert collector.take_back() == (ns(11), SECOND[count - 1].stamp)
     alone = contents(collect(*FIRST).trials)
@@ -190,11 +192,11 @@ def test_the_newest_trial_is_taken_back_complete_or_not_and_what_a_tracker_sends
     assert contents(collector.trials) == contents(collect(*FIRST, initial(21), action(22), goal(25)).trials)
     for _ in range(2):
         collector.take_back()
-    with pytest.raises(InputError, match='got no trial, expected one'):
+    with pytest.raises(InputError, match='no trial; expected one'):
         collector.take_back()
 
 
-def test_initial_chains_of_the_next_trial_stay_when_one_is_taken_back():
+def test_initial_chains_of_the_next_trial_stay_when_a_trial_is_discarded():
     collector = collect(*FIRST, *SECOND, initial(20))
     assert collector.take_back() == (ns(11), ns(15))
     collector.add(goal(16))
@@ -210,7 +212,7 @@ def test_another_frame_is_refused():
     collector = collect(initial(1))
     for message in (action(2, frame='map'), goal(3, frame=''), initial(4, frame='map')):
         text = refused(collector, message)
-        assert f"frame_id {message.frame_id!r}, expected 'world'" in text
+        assert f"frame_id {message.frame_id!r}; expected 'world'" in text
 
 
 def test_repeated_stamp_is_refused():
@@ -307,7 +309,7 @@ def test_goal_between_actions_is_stable_and_one_while_any_hand_moves_is_not():
     assert [g.stable for g in trial.goals] == [False, True, False, False, True]
 
 
-def test_annotated_goal_tells_which_hands_hold():
+def test_annotated_goal_gives_the_hands_that_hold():
     both = action(2, names=('a', 'b'), grips=(0, 9))
     trial = only(initial(1), both, goal(4, hands=[0] * 9 + [2, 2]), goal(5, hands=[0] * 11), goal(6))
     assert [g.held_by for g in trial.goals] == [('b',), (), ()]
@@ -325,12 +327,12 @@ def test_hand_that_never_opens_holds_in_every_goal_after_it_arrived():
 def test_goal_that_annotates_a_hand_that_was_not_there_is_refused():
     collector = collect(initial(1), action(2))
     text = refused(collector, goal(4, hands=[2] + [0] * 10))
-    assert 'points held by hand 2, expected hands 1 to 1 as in action' in text
+    assert 'points held by hand 2; expected hands 1 to 1 as in action' in text
 
 
 def test_goal_with_other_points_is_refused():
     collector = collect(initial(1), action(2), goal(4))
-    assert '12 points, expected 11 points as in initial_chain' in refused(collector, goal(5, count=12))
+    assert '12 points; expected 11 points as in initial_chain' in refused(collector, goal(5, count=12))
 
 
 @pytest.mark.parametrize(('length', 'tolerance', 'fits'), [
@@ -347,7 +349,7 @@ def test_goal_of_another_length_is_refused(length, tolerance, fits):
 
 # ---- what comes late
 
-def test_action_may_be_told_after_the_goals_that_were_observed_meanwhile():
+def test_action_may_come_after_goals_observed_during_it():
     collector = collect(initial(1), *(goal(k / 10) for k in range(21, 50)))
     assert collector.incomplete.startswith('an action after initial_chain')
     assert '29 goal_chain waiting' in collector.incomplete
@@ -407,26 +409,26 @@ def test_messages_stamped_before_every_initial_chain_are_refused():
     collector = collect(initial(5))
     for message in (action(2), goal(3)):
         text = refused(collector, message)
-        assert f'no initial_chain before it, expected one stamped earlier (the first is {initial(5)})' in text
-    assert (collector.problems, collector.take_news()) == ((), ())
+        assert f'no initial_chain before it; expected one stamped earlier (the first is {initial(5)})' in text
+    assert (collector.problems, collector.take_refusals()) == ((), ())
     collector.add(initial(1))
     assert (collector.count, collector.problems) == (1, ())
 
 
-def test_what_waited_is_refused_together_when_the_first_initial_chain_is_later():
+def test_waiting_messages_are_refused_together_if_the_first_initial_chain_is_later():
     collector = collect(goal(2), action(2.5), goal(4))
-    assert collector.take_news() == ()
+    assert collector.take_refusals() == ()
     collector.add(initial(5))
-    refusal, = collector.take_news()
-    assert str(refusal).startswith(f'{goal(2)} and 2 more: got no initial_chain before them')
-    assert collector.take_news() == ()
+    refusal, = collector.take_refusals()
+    assert str(refusal).startswith(f'{goal(2)} and 2 more: no initial_chain before them')
+    assert collector.take_refusals() == ()
     collector.add(initial(1))  # late, but the refused messages are used after all
-    assert (collector.count, collector.take_news()) == (1, ())
+    assert (collector.count, collector.take_refusals()) == (1, ())
 
 
 # ---- what status tells
 
-def test_incomplete_tells_what_the_newest_trial_lacks():
+def test_incomplete_names_the_messages_that_the_newest_trial_lacks():
     collector = collect()
     assert collector.incomplete == ''
     collector.add(initial(1))
@@ -439,7 +441,7 @@ def test_incomplete_tells_what_the_newest_trial_lacks():
     assert collector.incomplete == ''
 
 
-def test_trial_that_the_next_one_cuts_off_is_a_problem():
+def test_trial_that_the_next_trial_cuts_off_is_a_problem():
     collector = collect(initial(1), action(2), initial(3))
     problem, = collector.problems
     assert f'no goal_chain between {action(2)} and {initial(3)}' in str(problem)
@@ -467,7 +469,7 @@ def test_trial_that_the_end_cuts_off_is_a_loose_end(messages, words):
 
 
 @pytest.mark.parametrize('messages', [[], [initial(1)], [initial(1), action(2), goal(5)]])
-def test_what_did_not_begin_or_is_complete_is_no_loose_end(messages):
+def test_there_is_no_loose_end_before_a_trial_or_after_a_complete_trial(messages):
     assert collect(*messages).loose_end == ()
 
 
@@ -495,7 +497,7 @@ def test_hour_of_initial_chains_is_one_start(monkeypatch):
     assert collector.trials[0].velocity is not None
 
 
-def test_what_trials_use_is_never_forgotten(monkeypatch):
+def test_messages_that_trials_use_are_never_forgotten(monkeypatch):
     monkeypatch.setattr(module, 'KEPT', 20)
     collector = collect(initial(1), action(2, times=(0, 10)), *(goal(k / 10 + 2) for k in range(100)))
     before = contents(collector.trials)
@@ -519,7 +521,7 @@ def test_refusals_do_not_pile_up(monkeypatch):
 
 
 @pytest.mark.parametrize(('name', 'most'), [('MOST_MESSAGES', 20), ('MOST_NUMBERS', 19 * 33 + 15)])
-def test_what_is_too_much_is_refused_after_what_no_trial_uses_is_forgotten(monkeypatch, name, most):
+def test_messages_beyond_the_limit_are_refused_after_unused_ones_are_forgotten(monkeypatch, name, most):
     monkeypatch.setattr(module, name, most)
     collector = collect(initial(1), action(2, times=(0, 60)), goal(5))
     for k in range(10):
@@ -585,6 +587,86 @@ def test_messages_sent_twice_change_nothing(session, again):
     assert contents(feed(twice, options).trials) == contents(feed(arrived, options).trials)
 
 
+ORDERS = {
+    'in order': lambda messages: messages,
+    'reversed': lambda messages: messages[::-1],
+    'shuffled': lambda messages: [messages[k] for k in np.random.default_rng(1).permutation(len(messages))],
+    'a little late': lambda messages: sorted(messages, key=lambda message: message.stamp // 200_000_000
+                                             - message.stamp % 200_000_000 / 1e9),
+    'goals reversed': lambda messages: sorted(messages, key=lambda message: (
+        message.kind == GOAL, -message.stamp if message.kind == GOAL else message.stamp)),
+    'goals, actions, chains': lambda messages: sorted(messages, key=lambda message: (
+        ('goal_chain', 'action', 'initial_chain').index(message.kind))),
+    'actions, chains, goals': lambda messages: sorted(messages, key=lambda message: (
+        ('action', 'initial_chain', 'goal_chain').index(message.kind))),
+}
+
+
+def long_session(name, count):
+    """Return at least `count` messages in order of their stamps."""
+    if name == 'trials':
+        return [message for k in range(0, 4 * count, 12)
+                for message in (initial(k + 1), action(k + 2), goal(k + 6))]
+    begin = [initial(1), action(2)]
+    if name == 'actions':
+        return begin + [message for k in range(count // 2)
+                        for message in (goal(4 + k), action(4.5 + k, times=(0.0, 0.1)))]
+    if name == 'swinging':
+        return begin + stream(3.2, 3.2 + count / 30, move=lambda at: 0.3 * np.sin(3 * at))
+    return begin + stream(3.2, 3.2 + count / 30)
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('name', ['resting', 'swinging', 'actions', 'trials'])
+def test_the_work_is_in_proportion_to_the_messages_in_any_order_of_arrival(monkeypatch, name, order):
+    work = Counter()
+
+    def counted(place, what, size=lambda *_: 1):
+        before = getattr(place, what)
+
+        def call(*args, **rest):
+            work[what] += size(*args)
+            return before(*args, **rest)
+
+        monkeypatch.setattr(place, what, call)
+
+    counted(Chain, 'nearest')
+    counted(trial_builder, 'length_change')
+    counted(Stream, 'add')
+    counted(module, 'implausible', lambda trial, *_: len(trial.goals))
+    messages, collector = long_session(name, 300), TrialCollector(Options())
+    for message in ORDERS[order](messages):
+        try:
+            collector.add(message)
+        except InputError:
+            pass  # of actions and goal chains that come before their initial chain
+    trials = collector.trials
+    for what, most in (('nearest', 4), ('length_change', 4), ('add', 10), ('implausible', 10)):
+        assert work[what] <= most * len(messages), what
+    assert contents(trials) == contents(collect(*messages).trials)
+
+
+@pytest.mark.parametrize('order', ORDERS)
+def test_warnings_are_the_same_in_any_order_of_arrival(order):
+    """A collector warns once of each trial of a DLO in the air, at the latest when trials are asked for."""
+    def high(message):
+        return replace(message, chain=Chain(message.chain.points + (0, 0, 0.5))) if isinstance(
+            message, ChainMessage) else replace(message, positions=message.positions + (0, 0, 0.5))
+
+    messages = [*long_session('resting', 60), *(
+        replace(message, stamp=message.stamp + ns(100) - ns(0)) for message in long_session('trials', 3))]
+    collector = TrialCollector(Options())
+    for message in ORDERS[order]([*map(high, messages)]):
+        try:
+            collector.add(message)
+        except InputError:
+            pass
+    assert collector.count == 2
+    assert len(collector.trials) == 2
+    warnings = collector.take_warnings()
+    assert [text.partition(': ')[2][:15] for text in warnings] == 2 * ['a DLO at rest a']
+
+
 # ---- a tracker's stream
 
 def stream(begin, end, rate=30, move=lambda t: 0.0, seed=1, **rest):
@@ -609,7 +691,7 @@ def test_a_stream_that_shows_rest_is_one_goal_the_mean():
     assert longer.time == one.time
 
 
-def test_after_a_hand_opened_a_stream_tells_nothing_before_it_shows_rest():
+def test_after_a_hand_opened_a_stream_is_used_only_from_rest_on():
     messages = stream(3.01, 6, move=lambda t: max(0.3 - 4.9 * (t - 3) ** 2, 0))
     trial = only(initial(1), action(2), *stream(2, 3), *messages)
     assert [one.stable for one in trial.goals] == [False] * 30 + [True]
@@ -640,18 +722,18 @@ def test_each_action_ends_in_a_goal_of_its_own():
         np.testing.assert_allclose(one.chain.points[:, 1], place, atol=1e-3)
 
 
-def test_what_moves_the_dlo_after_it_came_to_rest_is_told_once_when_the_next_trial_begins():
+def test_a_dlo_that_moves_after_rest_is_reported_once_when_the_next_trial_begins():
     touched = stream(3.2, 9, move=lambda t: 0.1 * (t > 6))
     collector = collect(initial(1), action(2), *touched)
-    assert collector.take_news() == ()  # an action that explains it may still come
+    assert collector.take_refusals() == ()  # an action that explains it may still come
     problem, = collector.problems
     assert 'goal_chain' in str(problem) and 'had come to rest and moves again' in str(problem)
     one, = collector.trials[0].goals
     assert np.abs(one.chain.points[:, 1]).max() < 1e-3
     collector.add(initial(10, move=0.1))
-    assert list(map(str, collector.take_news())) == [str(problem)]
+    assert list(map(str, collector.take_refusals())) == [str(problem)]
     collector.add(action(11, away=0.1))
-    assert collector.take_news() == ()
+    assert collector.take_refusals() == ()
 
 
 def test_an_action_that_is_sent_when_it_is_over_explains_why_the_dlo_moved():
@@ -676,15 +758,15 @@ def test_each_chain_of_a_stream_is_looked_at_once(monkeypatch):
     assert len(collector.trials[0].goals) == 1
 
 
-def test_a_dlo_that_a_stream_shows_falling_is_not_doubted_before_it_rests():
+def test_there_is_no_warning_about_a_falling_dlo_before_it_rests():
     def at_height(message, height):
         return replace(message, chain=Chain(message.chain.points + (0, 0, height)))
 
     fall = [at_height(one, max(0.3 - 4.9 * (k / 30) ** 2, 0)) for k, one in enumerate(stream(3.01, 6))]
     collector = collect(initial(1), action(2), *(at_height(one, 0.3) for one in stream(2, 3)), *fall)
-    assert collector.take_doubts() == ()
+    assert collector.take_warnings() == ()
     collector = collect(initial(1), action(2), *(at_height(one, 0.3) for one in stream(2, 6)))
-    doubt, = collector.take_doubts()
+    doubt, = collector.take_warnings()
     assert '300 mm above the table' in doubt
 
 

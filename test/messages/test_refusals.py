@@ -30,7 +30,7 @@ def harmless(text):
                    for one in text)
 
 
-def test_what_a_terminal_would_obey_is_shown_as_an_escape():
+def test_control_characters_are_escaped():
     assert printable('a\x1b[2Jb\x9bc\u202ed\ud800e') == r'a\x1b[2Jb\x9bc\u202ed\ud800e'
     assert printable('two\r\nlines\tand a blank') == 'two  lines and a blank'
     assert printable('flexibilité, 柔軟さ, 🪢 \u2026') == 'flexibilité, 柔軟さ, 🪢 \u2026'
@@ -46,8 +46,8 @@ def test_an_error_is_one_short_line_whatever_came(parts):
 
 def test_of_a_refusal_that_is_too_long_the_thing_and_the_remedy_survive():
     text = str(InputError('goal_chain stamped 12.5 s', f"frame_id '{5_000_000 * 'x'}'", "'world'", 'reset'))
-    assert text.startswith("goal_chain stamped 12.5 s: got frame_id 'xxx")
-    assert text.endswith("xxx', expected 'world'; reset")
+    assert text.startswith("goal_chain stamped 12.5 s: frame_id 'xxx")
+    assert text.endswith("xxx'; expected 'world'; reset")
     assert '…' in text and len(text) == 300
 
 
@@ -56,15 +56,15 @@ def test_an_error_does_not_keep_the_megabytes_that_came():
     assert len(error.came) <= 300 and len(pickle.dumps(error)) < 1000
 
 
-def test_one_reason_many_times_is_one_line_with_its_first_stamp():
-    texts = [f'goal_chain stamped {k}.5 s: got NaN in point {k}' for k in range(100)]
+def test_refusals_for_one_reason_are_one_line_with_the_first_stamp():
+    texts = [f'goal_chain stamped {k}.5 s: NaN in point {k}' for k in range(100)]
     assert counted([*texts, "frame 'a'", "frame 'b\\'c'", 'something else']) == (
-        'goal_chain stamped 0.5 s: got NaN in point 0 (and 99 more like it)',
+        'goal_chain stamped 0.5 s: NaN in point 0 (and 99 more like it)',
         "frame 'a' (and 1 more like it)",
         'something else')
 
 
-def test_reasons_without_end_are_told_in_a_limited_number_of_lines():
+def test_the_number_of_reported_reasons_is_limited():
     texts = [f'{"x" * k} is wrong' for k in range(1, 500)]
     assert len(counted(texts)) == MOST_REASONS + 1
     refusals = Refusals()
@@ -73,7 +73,7 @@ def test_reasons_without_end_are_told_in_a_limited_number_of_lines():
     assert len(refusals.due(0.0)) == MOST_REASONS + 1
 
 
-def test_a_repeated_refusal_is_told_at_once_then_at_growing_intervals_and_never_lost():
+def test_a_repeated_refusal_is_reported_at_once_then_at_growing_intervals_and_never_lost():
     refusals, told = Refusals(), []
     for k in range(3000):  # at 10 Hz
         refusals.add(f'goal_chain stamped {k} s: bad')
@@ -87,7 +87,7 @@ def test_a_repeated_refusal_is_told_at_once_then_at_growing_intervals_and_never_
     assert refusals.rest() == []
 
 
-def test_session_with_thousands_of_bad_messages_is_told_in_one_line_for_each_reason(tmp_path, capsys):
+def test_session_with_thousands_of_bad_messages_gives_one_line_for_each_reason(tmp_path, capsys):
     bad = [(GOAL, with_point(4, float('inf'))(TYPES)) for _ in range(300)]
     for k, (_, message) in enumerate(bad):
         message.header.stamp.sec = 200 + k

@@ -7,7 +7,7 @@ import pytest
 from test_collector import action, goal, initial
 
 from dlo_calibration.errors import InputError
-from dlo_calibration.messages.stamp_order import StampOrder
+from dlo_calibration.messages.collector import StampOrder
 
 TRIALS = (initial(100), action(101), goal(110), initial(160), action(161), goal(170))
 
@@ -44,7 +44,7 @@ def test_an_action_or_goal_that_goes_back_into_an_earlier_trial_is_refused(messa
 
 
 def test_messages_under_way_as_the_clock_went_back_are_left_over():
-    order = after(*TRIALS).after_jump()
+    order = StampOrder(after(*TRIALS))
     order.add(initial(30))
     assert order.left_over(goal(170.5))
     for message in (action(31), goal(40), initial(160), action(161), goal(170)):  # the same as before
@@ -55,7 +55,7 @@ def test_messages_under_way_as_the_clock_went_back_are_left_over():
 
 
 def test_the_same_trial_again_is_not_left_over():
-    order = after(*TRIALS[:3]).after_jump()
+    order = StampOrder(after(*TRIALS[:3]))
     for message in TRIALS[:3]:
         assert not order.left_over(message)
         order.add(message)

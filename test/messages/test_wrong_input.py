@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 from hypothesis import given, HealthCheck
 from hypothesis import strategies as st
-from live import live_node, LOG_WARN, QUICK
+from live_node import live_node, LOG_WARN, QUICK
 import numpy as np
 import pytest
 from random_examples import drawing
@@ -21,7 +21,7 @@ from wrong_input import fuzzed_pairs, LATE, made, mutated_fields, mutations, WRO
 
 from dlo_calibration import calibrate, InputError
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.files.bag import decode, encode, Record
+from dlo_calibration.files.record import decode, encode, Record
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.session import read_session, session_trials
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
@@ -84,10 +84,10 @@ class Topics:
 
 @pytest.fixture(scope='module')
 def topics(shared_ros_environment, tmp_path_factory):
-    import graph
+    import ros_robot
 
     with live_node(shared_ros_environment, tmp_path_factory.mktemp('node')) as robot:
-        topics = Topics(robot, graph)
+        topics = Topics(robot, ros_robot)
         yield topics
         assert topics.calibrated() == topics.score  # after all that was refused
 
@@ -133,7 +133,7 @@ def test_wrong_message_in_a_file_is_refused_once_and_the_trials_calibrate(tmp_pa
     assert (code, about['refusals'], len(about['trials']), errors) == (0, [refusal], 2, [])
 
 
-def test_a_fit_tells_the_refusal_once_and_uses_the_other_trials(tmp_path, command):
+def test_a_fit_prints_a_refusal_once_and_uses_the_other_trials(tmp_path, command):
     case = WRONG[0]
     path = write_session(tmp_path / 'session.mcap', [*GOOD, (case.kind, made(case, FILES))], QUICK)
     code, result, (error,) = command('fit', path, '--json')
@@ -153,13 +153,13 @@ def test_live_and_replayed_refusals_are_the_same(topics, tmp_path):
 # ---- parameters
 
 PARAMETERS = [
-    ('mass', -1.0, 'parameter mass: got -1 kg, expected 0 to 1000 kg; choose a value in that range'),
-    ('evaluations', -1, 'parameter evaluations: got -1, expected 0 to 1e+06; choose a value in that range'),
-    ('friction', 100.5, 'parameter friction: got 100.5, expected 0 to 100; choose a value in that range'),
-    ('mass', 'heavy', "parameter mass: got 'heavy', expected a number; give it that type"),
-    ('search', 'magic', "parameter search: got 'magic', expected one of "),
-    ('calibrate', ['colour'], "parameter calibrate: got 'colour', expected one of "),
-    ('masss', 1.0, "parameter: got 'masss', expected one of mass, "),
+    ('mass', -1.0, 'parameter mass: -1 kg; expected 0 to 1000 kg; choose a value in that range'),
+    ('evaluations', -1, 'parameter evaluations: -1; expected 0 to 1e+06; choose a value in that range'),
+    ('friction', 100.5, 'parameter friction: 100.5; expected 0 to 100; choose a value in that range'),
+    ('mass', 'heavy', "parameter mass: 'heavy'; expected a number; give it that type"),
+    ('search', 'magic', "parameter search: 'magic'; expected one of "),
+    ('calibrate', ['colour'], "parameter calibrate: 'colour'; expected one of "),
+    ('masss', 1.0, "parameter: 'masss'; expected one of mass, "),
 ]
 
 
@@ -196,7 +196,7 @@ def test_wrong_parameter_is_refused_once_by_the_command_line(tmp_path, command, 
 
 
 @pytest.mark.parametrize(('name', 'value', 'text'), PARAMETERS)
-def test_wrong_parameter_recorded_in_a_file_is_left_out_and_told_once(tmp_path, command, name, value, text):
+def test_wrong_parameter_in_a_recording_is_left_out_with_one_warning(tmp_path, command, name, value, text):
     path = write_session(tmp_path / 'session.mcap', GOOD, {**QUICK, name: value})
     flags = (word for one in QUICK for word in (f'--{one}', *np.atleast_1d(QUICK[one])))
     code, result, errors = command('fit', path, '--json', *flags)
@@ -220,7 +220,7 @@ def collected(messages):
         except InputError as error:
             assert all((error.thing, error.came, error.expected, error.remedy))
             assert contents(collector.trials) == before
-        collector.take_news()
+        collector.take_refusals()
         str(collector.problems), str(collector.loose_end), str(collector.incomplete)
     return collector
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from stepping import SteppedRope
 
-from dlo_calibration.model.bending import bending_moments, natural_curvature, rest_shape
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import bending_moments, natural_curvature, ParameterSpace, rest_shape
 
 STIFFNESS, FRICTION, SLIP = 2e-3, 1.5, 0.4
 
@@ -80,7 +79,7 @@ def test_a_cycle_takes_the_energy_of_friction(reach):
     assert moments[400] == pytest.approx(moments[-1])  # it is closed
 
 
-def test_a_branch_is_the_first_one_twice_as_large():
+def test_a_branch_of_hysteresis_is_the_first_loading_twice_as_large():
     first = bending_moments(np.linspace(0, 2, 101), STIFFNESS, FRICTION, SLIP)
     moments = bending_moments(cycle(2, 100), STIFFNESS, FRICTION, SLIP)
     np.testing.assert_allclose(moments[100] - moments[100:301:2], 2 * first, atol=1e-12)

@@ -70,7 +70,7 @@ def test_places_on_an_arc_of_unequally_spaced_points():
     assert chain.resample(0.3 * (between - angles[0])) == pytest.approx(circle(between), abs=5e-5)
 
 
-def test_a_straight_chain_is_exact_whatever_its_spacing():
+def test_a_straight_chain_is_reproduced_exactly_with_any_spacing():
     chain = Chain(LINE)
     assert chain.length == pytest.approx(0.6, rel=1e-12)
     assert chain.arc_lengths() == pytest.approx(LINE[:, 0], abs=1e-12)
@@ -140,9 +140,9 @@ REFUSED = {
                  'leave such frames out'),
     'coincident': ({'points': LINE[[0, 1, 1, 2, 3]]}, 'coincident neighbours after point(s) 1', 'apart',
                    'remove the repeated points'),
-    'hands': ({'points': LINE, 'hands': [1, 0, 0]}, "'hands': got shape (3,)", 'each of the 5 points',
+    'hands': ({'points': LINE, 'hands': [1, 0, 0]}, "'hands': shape (3,)", 'each of the 5 points',
               'one value per point'),
-    'features': ({'points': LINE, 'features': [[1], [0], [0], [0], [1]]}, "'features': got shape (5, 1)",
+    'features': ({'points': LINE, 'features': [[1], [0], [0], [0], [1]]}, "'features': shape (5, 1)",
                  'each of the 5 points', 'one value per point'),
 }
 
@@ -167,9 +167,9 @@ def test_coordinates_that_cannot_be_metres_are_refused(far):
     points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
     assert len(Chain(points + 0.9e8)) == 3
     points[1, 2] = far
-    with pytest.raises(InputError, match='a coordinate of .* m in point 1, expected at most 1e.08 m'):
+    with pytest.raises(InputError, match='a coordinate of .* m in point 1; expected at most 1e.08 m'):
         Chain(points)
-    with pytest.raises(InputError, match='a coordinate of .* m in waypoint 1, expected at most 1e.08 m'):
+    with pytest.raises(InputError, match='a coordinate of .* m in waypoint 1; expected at most 1e.08 m'):
         Hand('left', (0,), np.arange(3.0), points)
 
 

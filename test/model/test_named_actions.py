@@ -98,7 +98,7 @@ def test_two_hands_change_their_distance(motion, moving, ends, height):
     assert first.end == pytest.approx(height / 0.1 + (0.5 if moving == 'both' else 1.0))
 
 
-def test_release_opens_where_the_hand_came_to_rest_with_what_it_gripped():
+def test_release_opens_a_hand_at_its_last_position_with_the_same_grip():
     hand = only_hand(Release(start=3.0), BEFORE)
     assert (hand.grips, hand.start, hand.end) == ((1, 2), 3.0, 3.0)
     np.testing.assert_array_equal(hand.positions, [[0.3, 0.4, 0.5]])
@@ -120,14 +120,14 @@ def test_table_has_all_and_each_knows_its_name():
 
 
 @pytest.mark.parametrize('name', NAMED_ACTIONS)
-def test_each_says_what_it_tells_of_every_parameter(name):
+def test_each_docstring_says_how_much_the_action_shows_of_each_parameter(name):
     lines = inspect.getdoc(NAMED_ACTIONS[name]).splitlines()
     assert [head for line in lines if (head := line.partition(': ')[0]) in PAPER_PARAMETERS] == list(
         PAPER_PARAMETERS)
 
 
 @pytest.mark.parametrize('make, match', [
-    (lambda: LiftAndHold(), 'lift_and_hold: got point None, fraction None'),
+    (lambda: LiftAndHold(), 'lift_and_hold: point None, fraction None'),
     (lambda: LiftAndHold(point=1, fraction=0.5), 'one of the two'),
     (lambda: LiftAndHold(point=6).action(CHAIN), 'point 6.*-6 to 5'),
     (lambda: LiftAndHold(point=-7).action(CHAIN), 'point -7'),
@@ -159,7 +159,7 @@ def test_each_says_what_it_tells_of_every_parameter(name):
     (lambda: Release(hold=True), 'hold'),
     (lambda: Release(hands=()).action(CHAIN), '0 hands'),
 ])
-def test_what_cannot_be_done_is_refused(make, match):
+def test_impossible_actions_are_refused(make, match):
     with pytest.raises(InputError, match=match):
         make()
 

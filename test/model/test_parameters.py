@@ -57,7 +57,7 @@ def test_every_parameter_says_what_it_is_and_has_a_default_on_the_scale(paramete
     assert 0 <= parameter.default <= 100
 
 
-def test_the_space_is_the_papers_four_unless_told_otherwise():
+def test_the_default_space_has_the_four_parameters_of_the_paper():
     space = ParameterSpace()
     assert space.free == PAPER
     assert space.dimension == 4
@@ -71,7 +71,7 @@ def test_a_point_of_the_cube_and_the_values_of_its_parameters():
         space.values([0.5])  # a coordinate is missing
 
 
-def test_physical_values_are_the_found_ones_then_the_fixed_ones_then_the_defaults():
+def test_physical_values_are_free_ones_then_fixed_ones_then_defaults():
     space = ParameterSpace(('flexibility',), {'friction': 10.0})
     physical = space.physical({'flexibility': 60.0}, length=1.0)
     assert set(physical) == BY_NAME.keys() - {*PART_NAMES, *REST_SHAPE}
@@ -97,7 +97,7 @@ def test_a_linear_scale_reaches_zero():
     assert curvature.value(5.0) == 50
 
 
-def test_as_many_parts_as_the_highest_one_named():
+def test_the_highest_stiffness_named_gives_the_number_of_parts():
     assert ParameterSpace().parts == 1
     space = ParameterSpace(('flexibility', 'stiffness_3'))
     assert space.parts == 3
@@ -121,13 +121,13 @@ def test_a_divided_space_finds_the_stiffness_of_every_part():
 
 
 @pytest.mark.parametrize(('arguments', 'text'), [
-    ({'free': ('bendiness',)}, "parameter: got 'bendiness', expected one of flexibility, elasticity"),
-    ({'fixed': {'bendiness': 1}}, "parameter: got 'bendiness', expected one of flexibility, elasticity"),
+    ({'free': ('bendiness',)}, "parameter: 'bendiness'; expected one of flexibility, elasticity"),
+    ({'fixed': {'bendiness': 1}}, "parameter: 'bendiness'; expected one of flexibility, elasticity"),
     ({'free': ()}, 'expected one or more different names'),
     ({'free': ('friction', 'friction')}, 'expected one or more different names'),
-    ({'fixed': {'friction': 100.1}}, 'parameter friction: got 100.1, expected a value from 0 to 100'),
-    ({'fixed': {'friction': -1}}, 'parameter friction: got -1, expected a value from 0 to 100'),
-    ({'fixed': {'friction': math.nan}}, 'parameter friction: got nan, expected a value from 0 to 100'),
+    ({'fixed': {'friction': 100.1}}, 'parameter friction: 100.1; expected a value from 0 to 100'),
+    ({'fixed': {'friction': -1}}, 'parameter friction: -1; expected a value from 0 to 100'),
+    ({'fixed': {'friction': math.nan}}, 'parameter friction: nan; expected a value from 0 to 100'),
 ])
 def test_refused_spaces(arguments, text):
     with pytest.raises(InputError) as refusal:

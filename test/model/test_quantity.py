@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-from dlo_calibration.model.quantity import exact, interval, measured, number
+from dlo_calibration.model.parameters import exact, interval, measured, number
 
 
 @pytest.mark.parametrize('value, text', [
@@ -29,6 +29,6 @@ def test_values_have_the_units_that_people_use():
 
 
 @given(st.lists(st.floats(allow_nan=False)))
-def test_what_programs_get_reads_back_exactly(values):
+def test_text_for_programs_reads_back_exactly(values):
     assert [float(word) for word in exact(values).split()] == values
     assert (exact(True), exact(7), exact('word')) == ('true', '7', 'word')

@@ -44,7 +44,7 @@ def test_the_unit_is_the_centimetre():
     assert difference_score(STRAIGHT, shorter, 0, [2]) == pytest.approx(2.5)
 
 
-def test_the_absolute_components_do_not_see_a_mirror_but_the_features_do():
+def test_a_mirrored_chain_changes_only_the_sum_over_features():
     mirrored = STRAIGHT * (-1, 1, 1)
     assert difference_score(STRAIGHT, mirrored, 0, []) == 0
     assert difference_score(STRAIGHT, mirrored, 0, [1]) == pytest.approx(200)
@@ -162,7 +162,6 @@ def test_points_that_were_not_seen_count_nowhere():
     assert focal_points(one).tolist() == [1]
     assert not feature_points(one)[0][[0, 5]].any()
     assert residuals(one, current[None]).tolist() == residuals(whole, current[None, kept]).tolist()
-    assert TrialScore(one).residuals(current[None]).tolist() == residuals(one, current[None]).tolist()
     reference, features = 0, np.flatnonzero(feature_points(one)[0][kept])
     assert TrialScore(one)(current[None]) == pytest.approx(
         difference_score(goal[kept], current[kept], reference, features))

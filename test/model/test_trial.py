@@ -66,7 +66,7 @@ def test_refused_trials(name):
     with pytest.raises(InputError) as refusal:
         trial(**arguments)
     text = str(refusal.value)
-    assert text.startswith("trial 'pull': got ")
+    assert text.startswith("trial 'pull': ")
     assert text.index(came) < text.index(expected)
     assert refusal.value.remedy
 
@@ -162,5 +162,5 @@ def test_a_gripped_end_that_the_initial_chain_does_not_show_is_where_goals_show_
 
 
 def test_an_initial_chain_without_an_end_is_refused():
-    with pytest.raises(InputError, match='whose last 2 points were not seen, expected at most one'):
+    with pytest.raises(InputError, match='whose last 2 points were not seen; expected at most one'):
         Trial('t', uneven([6, 7]), (Action((hand('left', 0.0, 1.0),)),), [Goal(uneven([0, 1]), 2.0)])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from resting import hung, LENGTH, observed, trial_of
+from rods_at_rest import hung, LENGTH, observed, trial_of
 
 from dlo_calibration.files.session import read_session
 from dlo_calibration.model.chain import Chain
@@ -129,7 +129,7 @@ def test_a_heavier_dlo_of_that_shape_is_stiffer():
     assert light.value - heavy.value == pytest.approx(100 / 4.5)
 
 
-def test_stiffness_is_not_told_where_the_mass_is_to_be_found():
+def test_stiffness_is_not_estimated_if_the_mass_is_free():
     trials = [trial_of(observed(hung(1e-3, CLAMP), 31), [(0, 1)])]
     found = prior_estimates(trials, ParameterSpace(free=('flexibility', 'mass')), None)
     assert (found['flexibility'].lower, found['flexibility'].upper) == (0, 100)
@@ -144,7 +144,7 @@ def test_few_points_give_finite_ranges(count, table_height):
         assert 0 <= one.lower <= one.upper <= 100
 
 
-def test_a_moving_dlo_tells_nothing_of_its_stiffness():
+def test_a_moving_dlo_gives_no_estimate_of_stiffness():
     goal = observed(hung(1e-3, CLAMP), 31)
     found = prior_estimates([trial_of(goal, [(0, 1)], stable=False)], SPACE, None)['flexibility']
     assert (found.lower, found.upper) == (0, 100) and np.isnan(found.value)

@@ -5,9 +5,9 @@
 
 import numpy as np
 import pytest
-from resting import hung, LENGTH, observed
+from rods_at_rest import hung, LENGTH, observed
 
-from dlo_calibration.observation.hanging import balance, hanging_parts, Part
+from dlo_calibration.observation.estimate import balance, hanging_parts, Part
 
 MASS = 0.03
 WEIGHT = MASS * 9.81 / LENGTH
@@ -64,7 +64,7 @@ def test_order_and_frame_do_not_matter():
     assert load_of(points[::-1], Part(0, 29, ('free', 'unknown'))).load == pytest.approx(found.load, rel=1e-3)
 
 
-def test_too_few_points_tell_nothing():
+def test_too_few_points_give_no_estimate():
     assert load_of(np.eye(3), Part(0, 2, ('unknown', 'unknown'))) is None
 
 
@@ -73,7 +73,7 @@ def parts(height, level, clamps=(), pins=(), touching=()):
     return list(hanging_parts(points, level, 0.005, clamps, pins, touching))
 
 
-def test_what_lies_ends_a_part():
+def test_a_hanging_part_ends_at_the_table():
     assert parts([0, 0, .1, .2, .1, 0, 0], 0.0, pins=[3]) == [Part(2, 4, ('unknown', 'unknown'), (3,))]
     assert parts([0, 0, .1, .2, .3], 0.0, pins=[4]) == [Part(2, 4, ('unknown', 'pin'))]
 
@@ -82,6 +82,6 @@ def test_a_clamp_ends_a_part_and_belongs_to_it():
     assert parts([1, 1, 1, 1, 1], None, clamps=[0, 1]) == [Part(1, 4, ('unknown', 'free'))]
 
 
-def test_what_nothing_holds_or_something_else_may_hold_is_left_out():
+def test_parts_that_nothing_holds_or_that_touch_something_are_left_out():
     assert parts([1, 1, 1, 1, 1], None) == []
     assert parts([1, 1, 1, 1, 1], None, pins=[0], touching=[3]) == []

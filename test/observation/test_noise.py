@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from resting import trial_of
+from rods_at_rest import trial_of
 
 from dlo_calibration import Action, Goal, Hand, Trial
 from dlo_calibration.model.chain import Chain
@@ -39,7 +39,7 @@ def noisy_arcs(count, even, radii=(0.3, -0.5)):
 
 @pytest.mark.parametrize('count', [21, 51])
 @pytest.mark.parametrize('even', [True, False])
-def test_noise_on_bent_chains_is_found_within_a_tenth(count, even):
+def test_noise_on_bent_chains_is_estimated_within_a_tenth(count, even):
     assert noise(noisy_arcs(count, even)) == pytest.approx(MILLIMETRE, rel=0.1)
 
 
@@ -73,7 +73,7 @@ def test_few_points_give_the_size_at_least(count):
 
 
 @pytest.mark.parametrize('count', [3, 4])
-def test_fewer_points_cannot_tell(count):
+def test_fewer_points_give_no_noise_level(count):
     chain = np.eye(4, 3)[:count]
     assert np.isnan(noise([trial_of(chain, [(0,)], chain)]))
 

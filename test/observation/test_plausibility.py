@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from resting import trial_of
+from rods_at_rest import trial_of
 from trial_contents import anew
 
 from dlo_calibration.calibration.options import Options
@@ -78,9 +78,9 @@ def test_nothing_is_wrong_with_a_sample_request(name):
     ({'scale': 1000.0}, ('601.5 m long', 'millimetres (0.601 m then)')),
     ({'scale': 1 / 0.0254}, ('23.', 'inches (0.601 m then)')),
 ], ids=['above', 'near above', 'below', 'y up', 'x up', 'camera', 'millimetres', 'inches'])
-def test_wrong_frame_or_unit_is_told_with_its_remedy(lying, change, words):
+def test_a_warning_about_a_wrong_frame_or_unit_names_the_remedy(lying, change, words):
     text, = implausible(moved(lying[0], **change), 0.0)
-    assert text.startswith('trial 1: got a DLO ')
+    assert text.startswith('trial 1: a DLO ')
     for word in words:
         assert word in text
 
@@ -103,7 +103,7 @@ def test_a_dlo_that_nothing_holds_needs_a_table_or_an_obstacle(lying):
     assert implausible(moved(lying[0], (0, 0, 0.75)), 0.0, scene=True) == ()
 
 
-def test_points_that_run_from_the_other_end_are_told(lying):
+def test_there_is_a_warning_about_points_that_run_from_the_other_end(lying):
     first, second = lying[:2]
     swapped = replace(first, goals=(replace(first.goals[0], chain=turned(first.goals[0].chain)),))
     text, = implausible(swapped, 0.0)
@@ -130,17 +130,17 @@ def test_a_dlo_on_a_pin_hangs_straight_below_it():
     assert '180 degrees' in text
 
 
-def test_the_collector_tells_it_once_when_the_trial_is_complete(lying):
+def test_the_collector_warns_once_when_a_trial_is_complete(lying):
     collector = TrialCollector(Options())
     told = []
     for message in trial_messages(tuple(moved(trial, (0, 0, 0.75)) for trial in lying[:2]), 'camera'):
         collector.add(message)
-        told += [(type(message) is ActionMessage, text) for text in collector.take_doubts()]
+        told += [(type(message) is ActionMessage, text) for text in collector.take_warnings()]
     assert [text.split(':')[0] for _, text in told] == ['trial 1', 'trial 2']
-    assert collector.take_doubts() == ()
+    assert collector.take_warnings() == ()
     assert collector.count == 2
     right = anew(collector, Options(table_height=0.75))
-    assert right.take_doubts() == ()
+    assert right.take_warnings() == ()
 
 
 @pytest.mark.parametrize('source', [('reference', 'object2'), ('mocap', 'dlo3', '--recordings', '0'),

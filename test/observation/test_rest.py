@@ -78,7 +78,7 @@ def test_chains_after_it_was_moved_are_left_out():
     assert still.moved is None
 
 
-def test_one_wrong_chain_of_a_tracker_ends_no_rest():
+def test_a_single_wrong_chain_does_not_end_rest():
     rest, _ = follow(lambda t: 0.3 * (abs(t - 2.5) < 0.01) + 0.3 * (abs(t - 4) < 0.01), rate=100.0)
     assert rest.moved is None
     assert np.abs(rest.points - STRAIGHT).max() < 2e-3

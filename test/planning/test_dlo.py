@@ -3,7 +3,7 @@
 
 """The posterior gives back the intervals and correlations of the result."""
 
-from calibrated import MadeUpDlo, ROPE
+from made_up_dlo import MadeUpDlo, ROPE
 import numpy as np
 import pytest
 

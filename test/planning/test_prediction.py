@@ -5,7 +5,7 @@
 
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 
-from calibrated import HOSE, MadeUpDlo, ROPE, straight
+from made_up_dlo import HOSE, MadeUpDlo, ROPE, straight
 import numpy as np
 import pytest
 from toy_simulator import ToySimulator
@@ -13,10 +13,9 @@ from toy_simulator import ToySimulator
 from dlo_calibration import calibrate, Chain, InputError, Options, read_session
 from dlo_calibration.calibration.engines import make_simulator
 from dlo_calibration.evaluation import Pool
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import session_trials
+from dlo_calibration.files.session import samples, session_trials
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
-from dlo_calibration.planning import Job, Posterior, Rehearser, Step
+from dlo_calibration.planning import ActionStep, Posterior, RehearsalJob, Rehearser
 from dlo_calibration.planning.prediction import intervals, simulate
 
 
@@ -45,12 +44,12 @@ def test_a_hand_holds_on_until_it_is_released():
 def test_paths_and_steps_are_taken_as_they_are():
     lift = LiftAndHold(point=20, height=0.1).action(straight())
     opened, = simulate(MadeUpDlo(), straight(), [lift], draws=0).steps
-    held, = simulate(MadeUpDlo(), straight(), [Step(lift, ('left_hand',))], draws=0).steps
+    held, = simulate(MadeUpDlo(), straight(), [ActionStep(lift, ('left_hand',))], draws=0).steps
     assert opened.name == held.name == 'hand_paths'
     assert opened.chain[20, 2] < 0.02 < 0.09 < held.chain[20, 2]
 
 
-def test_what_is_uncertain_makes_the_interval_wide():
+def test_uncertain_parameters_make_the_interval_wide():
     unsure = {**ROPE, 'friction': (70.0, 40.0, 100.0)}
     action = GraspAndPlace(point=10, to=(0.3, 0.25, 0.004))
 
@@ -82,7 +81,7 @@ def test_the_noise_of_the_start_makes_the_interval_wide():
     assert 3e-4 < widths[1] and widths[0] < widths[1] / 10
 
 
-def test_a_finer_simulation_tells_how_rough_the_usual_one_is():
+def test_the_difference_to_a_finer_simulation_widens_the_interval():
     place = GraspAndPlace(point=0, to=(0.1, 0.2, 0.004))
     coarse, usual = (simulate(MadeUpDlo(), straight(), [place], draws=0,
                               options=Options(nodes=nodes)).steps[0] for nodes in (15, 41))
@@ -99,7 +98,7 @@ def test_90_percent_of_the_points_of_a_trial_that_was_left_out_are_in_their_inte
     for k in (1, 2):
         found = calibrate([one for one in trials if one is not trials[k]], options)
         goal, = trials[k].goals
-        step, = simulate(found, trials[k].initial, [Step(trials[k].actions[0], goal.held_by)]).steps
+        step, = simulate(found, trials[k].initial, [ActionStep(trials[k].actions[0], goal.held_by)]).steps
         inside.append((step.lower <= goal.chain.points) & (goal.chain.points <= step.upper))
         assert (step.upper - step.lower).mean() < 0.007  # of a rope of 60 cm, seen with a noise of 1 mm
     assert np.mean(inside) == pytest.approx(0.9, abs=0.06)
@@ -115,25 +114,26 @@ def test_the_same_seed_gives_the_same_prediction():
 
 def test_rehearsals_do_not_depend_on_the_executor():
     simulator = make_simulator(Options())
-    step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
-    jobs = [Job(straight(), (step, step), physical, courses=True)
+    step = ActionStep(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    jobs = [RehearsalJob(straight(), (step, step), physical, trajectories=True)
             for physical in Posterior.of(MadeUpDlo()).draws(4, 1)]
     alone = Rehearser(Pool(simulator))
     with ThreadPoolExecutor(2) as executor:
         together = Rehearser(Pool(simulator, executor))
         for one, other in zip(alone(jobs), together(jobs), strict=True):
             assert np.array_equal(one.chains, other.chains)
-            assert all(map(np.array_equal, one.courses, other.courses))
-            assert len(one.courses) == 2 and len(one.courses[0]) > 10
+            assert all(map(np.array_equal, one.trajectories, other.trajectories))
+            assert len(one.trajectories) == 2 and len(one.trajectories[0]) > 10
     assert alone.count == together.count == 8
 
 
 @pytest.mark.parametrize('speed', [0.1, 1.0])
-def test_a_course_misses_nothing_however_fast_the_hand_is(speed):
-    step = Step(GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.1, speed=speed).action(straight()))
+def test_a_trajectory_has_no_gaps_however_fast_the_hand_is(speed):
+    lift = GraspAndPlace(point=0, direction=(0, 1, 0), distance=0.1, speed=speed)
+    step = ActionStep(lift.action(straight()))
     found, = Rehearser(Pool(make_simulator(Options())))(
-        [Job(straight(), (step,), Posterior.of(MadeUpDlo()).best, courses=True)])
-    course, = found.courses
+        [RehearsalJob(straight(), (step,), Posterior.of(MadeUpDlo()).best, trajectories=True)])
+    course, = found.trajectories
     assert np.linalg.norm(np.diff(course[:, 0], axis=0), axis=1).max() < 0.0101
     assert course[:, 0, 2].max() > 0.05
     np.testing.assert_allclose(course[-1, 0], step.action.hands[0].positions[-1], atol=0.0101)
@@ -142,33 +142,33 @@ def test_a_course_misses_nothing_however_fast_the_hand_is(speed):
 def test_a_hand_that_holds_does_so_on_the_way_of_another_one():
     lift = LiftAndHold(point=20, height=0.1, hand='a').action(straight())
     drag = Drag(point=0, to=(0.0, 0.1, 0.004), hand='b').action(straight())
-    steps, physical = (Step(lift, ('a',)), Step(drag, ('a',))), Posterior.of(MadeUpDlo()).best
+    steps, physical = (ActionStep(lift, ('a',)), ActionStep(drag, ('a',))), Posterior.of(MadeUpDlo()).best
     without, with_courses = Rehearser(Pool(make_simulator(Options())))(
-        [Job(straight(), steps, physical, courses) for courses in (False, True)])
-    assert with_courses.courses[1][:, 20, 2].min() > 0.1
+        [RehearsalJob(straight(), steps, physical, courses) for courses in (False, True)])
+    assert with_courses.trajectories[1][:, 20, 2].min() > 0.1
     np.testing.assert_allclose(with_courses.chains, without.chains, atol=1e-3)
 
 
 def test_draws_of_the_same_actions_are_rehearsed_as_each_alone():
-    step = Step(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    step = ActionStep(GraspAndPlace(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     rehearse, start, steps = Rehearser(Pool(make_simulator(Options()))), straight(), (step,)
     draws = Posterior.of(MadeUpDlo()).draws(3, 1)
-    together = rehearse([Job(start, steps, physical) for physical in draws])
+    together = rehearse([RehearsalJob(start, steps, physical) for physical in draws])
     for one, physical in zip(together, draws, strict=True):
-        alone, = rehearse([Job(straight(), (step,), physical)])
+        alone, = rehearse([RehearsalJob(straight(), (step,), physical)])
         assert np.array_equal(one.chains, alone.chains)
     assert not np.array_equal(together[0].chains, together[1].chains)
 
 
 def test_a_rehearsal_that_diverges_says_so():
-    step = Step(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
+    step = ActionStep(Drag(point=5, direction=(0, 1, 0), distance=0.1).action(straight()))
     physical = Posterior.of(MadeUpDlo()).best
-    found, = Rehearser(Pool(ToySimulator(fail_below=101)))([Job(straight(), (step,), physical)])
+    found, = Rehearser(Pool(ToySimulator(fail_below=101)))([RehearsalJob(straight(), (step,), physical)])
     assert 'diverged' in found.failure
     assert np.isnan(found.chains).all()
 
 
-def test_it_can_be_stopped():
+def test_a_prediction_can_be_stopped():
     with pytest.raises(CancelledError):
         simulate(MadeUpDlo(), straight(), [Drag(point=0, to=(0.1, 0.1, 0.004))], should_stop=lambda: True)
 

@@ -93,7 +93,7 @@ def test_picture_of_unusual_trials(trial):
 
 def test_file_that_cannot_be_written_is_an_input_error(tmp_path):
     trial, = toy_trials(1)
-    with pytest.raises(InputError, match='--output'):
+    with pytest.raises(InputError, match='choose another place'):
         session_picture([trial], None, tmp_path / 'none' / 'one.png')
 
 
@@ -240,5 +240,5 @@ def test_animation_moves_and_rests_at_its_end(tmp_path, monkeypatch):
 
 def test_animation_that_cannot_be_written_is_an_input_error(tmp_path):
     trial = tracked(3)
-    with pytest.raises(InputError, match='--output'):
+    with pytest.raises(InputError, match='choose another place'):
         write_animation(trial, simulated_motion(trial, Following(), {}), tmp_path / 'none' / 'one.gif')

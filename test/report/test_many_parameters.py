@@ -12,17 +12,16 @@ import re
 from lxml import etree
 import numpy as np
 import pytest
-from remembering import remembering_result, remembering_space
-from result_message import result_values
+from rest_shape_result import rest_shape_result, rest_shape_space
 from toy_messages import toy_trials
 from toy_simulator import new_toy, ToySimulator
+from wire import result_values
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.calibration.plain import plain
-from dlo_calibration.evaluation.evaluator import Evaluator
-from dlo_calibration.files.evaluations import write_evaluations
-from dlo_calibration.files.result import description_document, read_description
+from dlo_calibration.calibration.result import plain
+from dlo_calibration.evaluation.evaluation import Evaluator
+from dlo_calibration.files.result import description_document, read_description, write_evaluations
 from dlo_calibration.inference.missing_parameters import MissingParameter
 from dlo_calibration.inference.slices import MOST_LINES, simulate_slices
 from dlo_calibration.inference.uncertainty import IDENTIFIABLE, NOT_IDENTIFIABLE, WEAK
@@ -35,16 +34,17 @@ from dlo_calibration.report.bending_drawing import (
     moment_panels,
     rest_shape_panels,
 )
-from dlo_calibration.report.page import MOST_CORRELATIONS, Origin, write_report
+from dlo_calibration.report.page import MOST_CORRELATIONS, Origin, page_of
 from dlo_calibration.report.sentences import sentences
 from dlo_calibration.report.terminal import print_result
 from dlo_calibration.ros import diagnostics
+from dlo_calibration.writing import write_file
 
 
 @pytest.fixture(scope='module')
 def result():
     """Return a result with thirty parameters."""
-    found = remembering_result()
+    found = rest_shape_result()
     assert len(found.parameters) == 30
     return found
 
@@ -55,7 +55,7 @@ def straight():
     return calibrate(toy_trials(1), Options.of({'workers': 1, 'evaluations': 10}), make_simulator=new_toy)
 
 
-def test_the_file_has_all_of_it(result, tmp_path):
+def test_the_result_file_has_every_parameter(result, tmp_path):
     document = description_document(result)
     found = read_description(document)
     assert found.physical() == result.physical()
@@ -67,7 +67,7 @@ def test_the_file_has_all_of_it(result, tmp_path):
     assert 'rest_curvature_y9' in (tmp_path / 'evaluations.csv').read_text().splitlines()[0]
 
 
-def test_a_file_from_before_there_was_memory_is_read(straight):
+def test_a_result_file_without_rest_shape_and_friction_is_read(straight):
     root = etree.fromstring(description_document(straight))
     parameters = root.find('parameters')
     for element in parameters.findall('fixed'):
@@ -111,7 +111,7 @@ def test_sentences_say_where_it_is_curved_and_what_it_keeps(result):
     assert 'rest_curvature' not in sentences(missing)[-1]
 
 
-def test_what_is_not_known_is_not_claimed(result, without_drawings):
+def test_friction_between_strands_gives_a_sentence_only_where_it_is_known(result, without_drawings):
     def kept(**verdicts):
         changed = {name: replace(result.parameters[name], verdict=verdict)
                    for name, verdict in verdicts.items()}
@@ -142,7 +142,7 @@ def test_the_page_stays_small(result, tmp_path, without_drawings):
     evaluator = Evaluator(result.trials, result.space, ToySimulator())
     slices = simulate_slices(evaluator, result.best, result.std, result.examination, seconds=60)
     assert len(slices.lines) == MOST_LINES and slices.complete
-    write_report(tmp_path / 'page.html', result, Origin('s', 'a command', Options()), lambda: slices)
+    write_file(tmp_path / 'page.html', page_of(result, Origin('s', 'a command', Options()), slices))
     page = (tmp_path / 'page.html').read_text(encoding='utf-8')
     assert 'rest_curvature 9' in page and 'The shape when nothing bends it' in page
     assert 'The bend that it keeps' in page
@@ -161,7 +161,7 @@ def test_drawings_show_what_there_is(result, straight, without_drawings):
     assert re.search(r'1000 mm long: its ends are \d+ mm apart', shape.words)
     moment, = moment_panels(result)
     assert 'mN m,' in moment.words and '2.01 1/m of curvature stay' in moment.words
-    moment, = moment_panels(replace(result, space=remembering_space(mass=0.0)))
+    moment, = moment_panels(replace(result, space=rest_shape_space(mass=0.0)))
     assert 'mN m per N/m,' in moment.words
     assert rest_shape_panels(straight) == moment_panels(straight) == []
 

@@ -28,10 +28,12 @@ from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
 from dlo_calibration.calibration.stages import sliced
 from dlo_calibration.errors import InputError
+from dlo_calibration.evaluation.digest import file_digests
 from dlo_calibration.inference.advice import Advice
-from dlo_calibration.model.quantity import interval, measured
+from dlo_calibration.model.parameters import interval, measured
 from dlo_calibration.report.landscape import convergence_panel
-from dlo_calibration.report.page import digests, MOST_TRIALS, Origin, repeating_command, write_report
+from dlo_calibration.report.page import MOST_TRIALS, Origin, page_of, repeating_command
+from dlo_calibration.writing import write_file
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 QUIET = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
@@ -59,7 +61,7 @@ def slices(result):
 def written(folder, result, origin=None, slices=None):
     """Write the page of a result and return its text."""
     path = folder / 'report.html'
-    write_report(path, result, origin or Origin('s', 'a command', OPTIONS), lambda: slices)
+    write_file(path, page_of(result, origin or Origin('s', 'a command', OPTIONS), slices))
     return path.read_text(encoding='utf-8')
 
 
@@ -128,7 +130,7 @@ def test_drawings_are_images_that_stand_alone_and_do_not_change(result, drawn, t
     assert Outline(written(tmp_path, result)).drawings.items() <= drawings.items()
 
 
-def test_needs_nothing_but_itself(drawn):
+def test_the_page_needs_no_other_file(drawn):
     ids = set(re.findall(' id="([^"]+)"', drawn))
     for reference in Outline(drawn).references:
         assert reference.startswith('#') and reference[1:] in ids
@@ -142,7 +144,7 @@ def test_names_are_text_not_html(result, page):
     assert '<b>first</b> & "only"' in words(text)
 
 
-def test_says_what_is_known_in_units(result, page):
+def test_the_page_gives_values_in_units(result, page):
     text = words(page(result))
     for name, estimate in result.parameters.items():
         assert f'{name} is known well' in text or f'{name} is known only roughly' in text \
@@ -151,7 +153,7 @@ def test_says_what_is_known_in_units(result, page):
     assert measured(result.errors.mean, 'm') in text
 
 
-def test_says_which_action_would_tell(result, page):
+def test_the_page_advises_an_action(result, page):
     advice = Advice('drag', 'drag the middle', 'friction', 0.2, 0.05, 0.3, 0.5)
     text = words(page(replace(result, advice=advice)))
     assert 'To know friction better, drag the middle' in text
@@ -204,7 +206,7 @@ def test_command_and_options_that_repeat_it(result, page, tmp_path):
     (tmp_path / 'session.mcap').write_bytes(b'what was heard')
     command = repeating_command('session.mcap', OPTIONS)
     assert command == 'dlo-calibration fit session.mcap --mass 0.03 --evaluations 60 --seed 4'
-    text = page(result, Origin('s', command, OPTIONS, digests([tmp_path / 'session.mcap'])))
+    text = page(result, Origin('s', command, OPTIONS, file_digests([tmp_path / 'session.mcap'])))
     assert command in unescape(text)
     assert hashlib.sha256(b'what was heard').hexdigest() in text
     assert f'numpy {np.__version__}' in words(text)
@@ -212,8 +214,8 @@ def test_command_and_options_that_repeat_it(result, page, tmp_path):
 
 
 def test_page_that_cannot_be_written_is_an_input_error(result, tmp_path, without_drawings):
-    with pytest.raises(InputError, match='--output'):
-        write_report(tmp_path / 'none' / 'report.html', result, Origin('s', 'c', OPTIONS))
+    with pytest.raises(InputError, match='choose another place'):
+        write_file(tmp_path / 'none' / 'report.html', 'the page')
 
 
 @pytest.fixture(scope='module')
@@ -280,7 +282,7 @@ def test_browser_shows_it_without_scrolling_sideways(drawn, browse, tmp_path):
             assert (part < 128).mean() > 0.002  # there is something to read everywhere
 
 
-def test_measure_sees_what_is_too_wide(browse, tmp_path):
+def test_the_measurement_of_width_detects_wide_elements(browse, tmp_path):
     frame = tmp_path / 'frame.html'
     frame.write_text(framed('<div style="width:700px">wide</div>', {390: 500}), encoding='utf-8')
     assert needed(browse('--dump-dom', Path(frame).as_uri()), 390)[0] >= 700

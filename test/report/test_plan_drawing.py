@@ -5,8 +5,7 @@
 
 from dataclasses import replace
 
-from calibrated import MadeUpDlo, straight
-from made_up_plan import made_up_plan, MOVES
+from made_up_dlo import made_up_plan, MadeUpDlo, MOVES, straight
 import numpy as np
 from PIL import Image, ImageColor
 import pytest
@@ -18,7 +17,7 @@ from dlo_calibration.planning.dlo import Posterior
 from dlo_calibration.report.drawing import View
 from dlo_calibration.report.figure import BAND, blank_figure, SIMULATED
 from dlo_calibration.report.plan_drawing import plan_trial, write_plan_animation, write_plan_picture
-from dlo_calibration.report.plan_sentences import plan_sentences
+from dlo_calibration.report.sentences import plan_sentences
 
 
 def pixels(plan, path):
@@ -39,7 +38,7 @@ def test_a_picture_has_a_panel_for_each_action(tmp_path):
 
 
 def test_a_picture_that_cannot_be_written_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match='--output'):
+    with pytest.raises(InputError, match='choose another place'):
         write_plan_picture(made_up_plan(), tmp_path / 'none' / 'plan.png')
 
 
@@ -101,9 +100,9 @@ def test_after_the_actions_a_sentence_is_about_the_goal(changes, words):
     assert plan_sentences(made_up_plan(**changes))[changes['actions']].startswith(words)
 
 
-def test_remarks_are_told_last():
-    assert plan_sentences(made_up_plan(remarks=('the goal is longer',)))[-1] == 'The goal is longer.'
+def test_warnings_are_the_last_sentences():
+    assert plan_sentences(made_up_plan(warnings=('the goal is longer',)))[-1] == 'The goal is longer.'
 
 
-def test_a_goal_that_is_not_reached_is_told_with_the_reason_why_the_search_ended():
+def test_a_missed_goal_is_reported_with_the_reason_why_the_search_ended():
     assert 'The search ended: stopped.' in plan_sentences(made_up_plan(stop_reason='stopped'))[-1]

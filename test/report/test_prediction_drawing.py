@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from calibrated import MadeUpDlo, straight
+from made_up_dlo import MadeUpDlo, straight
 import numpy as np
 from PIL import Image, ImageColor
 import pytest
@@ -13,8 +13,8 @@ import pytest
 from dlo_calibration.model.named_actions import Drag, GraspAndPlace, LiftAndHold, Release
 from dlo_calibration.planning.prediction import simulate
 from dlo_calibration.report.figure import BAND, SIMULATED
-from dlo_calibration.report.prediction_drawing import write_prediction_picture
-from dlo_calibration.report.prediction_sentences import prediction_sentences, width
+from dlo_calibration.report.plan_drawing import write_prediction_picture
+from dlo_calibration.report.sentences import prediction_sentences, width
 
 
 @pytest.fixture(scope='module')
@@ -47,13 +47,13 @@ def test_of_many_actions_five_are_shown(prediction, tmp_path):
     assert picture(many, tmp_path).shape[0] < 5 * picture(one, tmp_path).shape[0]
 
 
-def test_a_name_can_be_anything(prediction, tmp_path):
+def test_a_trial_name_can_be_any_text(prediction, tmp_path):
     one = replace(prediction, steps=prediction.steps[:1])
     assert picture(one, tmp_path, '$_{\n_').std() > 10
 
 
-def test_sentences_tell_what_is_not_as_usual(prediction):
-    restless = replace(prediction, remarks=('a remark',),
+def test_sentences_mention_a_dlo_that_does_not_come_to_rest_and_warnings(prediction):
+    restless = replace(prediction, warnings=('a remark',),
                        steps=(replace(prediction.steps[0], settled=False),))
     sentence, remark = prediction_sentences(restless)
     assert sentence.endswith('; the DLO did not come to rest.') and remark == 'a remark'

@@ -11,7 +11,7 @@ from toy_simulator import new_toy
 
 from dlo_calibration import calibrate
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.inference.confirmation import Confirmation
+from dlo_calibration.inference.examination import Confirmation
 from dlo_calibration.inference.uncertainty import NOT_IDENTIFIABLE, WEAK
 from dlo_calibration.model.score import PointErrors
 from dlo_calibration.report.sentences import sentences, verdict
@@ -32,7 +32,7 @@ def test_each_parameter_has_a_sentence_with_its_quantity(result):
     assert not any('mass' in text for text in told)
 
 
-def test_what_is_known_well_comes_first_and_what_is_not_is_no_value(result):
+def test_well_known_parameters_come_first_and_unknown_ones_get_no_value(result):
     changed = dict(result.parameters)
     changed['flexibility'] = replace(changed['flexibility'], verdict=NOT_IDENTIFIABLE, identifiable=False,
                                      physical_lower=0.001, physical_upper=0.01)
@@ -59,8 +59,8 @@ def test_good_result_is_usable(result):
 
 def test_result_that_should_not_be_used_says_why(result):
     found = result.examination
-    implausible = replace(result, doubts=('trial 1: got a DLO in the air',))
-    assert verdict(implausible) == 'Do not use this result: trial 1: got a DLO in the air.'
+    implausible = replace(result, implausible=('trial 1: a DLO in the air',))
+    assert verdict(implausible) == 'Do not use this result: trial 1: a DLO in the air.'
     assert '51.7 % of the length: check frames' in with_error(result, 0.517 * result.length).unusable
     apart = Confirmation('bullet', 1.0, (1.0, 1.0), result.errors, 0.02, 0.1)
     assert 'engine bullet differs from toy by 20 mm' in replace(result, confirmation=apart).unusable
@@ -109,7 +109,7 @@ def test_a_lower_score_elsewhere_is_explained_in_one_sentence(result):
     assert '4.5 instead of 4.83 cm' in text
 
 
-def test_search_that_did_not_arrive_is_told(result):
+def test_a_search_that_did_not_converge_is_mentioned(result):
     told = sentences(replace(result, examination=replace(result.examination, regular=False)))
     assert any('has not reached a minimum' in text for text in told)
 

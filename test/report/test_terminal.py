@@ -25,7 +25,7 @@ def last_line(known):
     return next(line for line in reversed(stream.getvalue().splitlines()) if '8/10' in line)
 
 
-def test_what_a_log_answers_tells_no_time_left(monkeypatch):
+def test_evaluations_from_a_log_do_not_count_for_the_time_left(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm')
     assert '-:--:--' not in last_line(0)
     assert '-:--:--' in last_line(8)

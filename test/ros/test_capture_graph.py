@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dlo_calibration.capture.camera import read_lens
-from dlo_calibration.capture.raw_image import decoded, ENCODINGS
 from dlo_calibration.errors import InputError
+from dlo_calibration.vision.camera import read_lens
+from dlo_calibration.vision.photograph import decoded, ENCODINGS
 
 pytest.importorskip('rclpy', reason='needs ROS 2, sourced or from PyPI')
 
@@ -25,7 +25,7 @@ COLOUR = (200, 40, 90)  # red, green, blue
 @contextmanager
 def publishing(environment, messages):
     """Publish messages of topics, given with their types, again and again."""
-    from graph import robot_of, TYPES
+    from ros_robot import robot_of, TYPES
 
     with robot_of(environment) as robot:
         publishers = [(robot.node.create_publisher(TYPES.find(kind), topic, 1), TYPES.find(kind)(**fields))
@@ -83,7 +83,7 @@ def test_photographs_come_from_topics_with_the_lens_of_their_camera(ros_environm
 
 @pytest.mark.long
 def test_trials_are_sent_to_a_calibrator_in_another_process(ros_environment, tmp_path):
-    from graph import child
+    from ros_robot import child
 
     with served(tmp_path / 'project') as page:
         whole_trial(page)

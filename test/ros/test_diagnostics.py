@@ -4,11 +4,11 @@
 """What the node tells reads back exactly, under the names of the contract."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from result_message import result_values
-from wire import wire
+from wire import result_values, wire
 
 from dlo_calibration.calibration.result import CalibrationResult, ParameterEstimate
 from dlo_calibration.evaluation.evaluation import Evaluation
@@ -42,7 +42,7 @@ def by_name(message):
     return {one.name: (one, {pair.key: pair.value for pair in one.values}) for one in message.status}
 
 
-def test_result_tells_every_parameter_exactly(types):
+def test_result_has_every_parameter_exactly(types):
     found = found_result()
     message = diagnostics.result(types, found, STAMP)
     values = result_values(message)
@@ -59,7 +59,7 @@ def test_result_tells_every_parameter_exactly(types):
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
 
 
-def test_result_tells_the_whole(types):
+def test_result_has_the_values_of_the_whole_calibration(types):
     one, values = by_name(diagnostics.result(types, found_result(), STAMP))['calibration']
     assert values.pop('seconds') == '9.1'
     assert [float(score) for score in values.pop('scores').split()] == [40.5, 20.25]
@@ -79,19 +79,19 @@ def test_result_tells_the_whole(types):
     assert one.level == types.level(0)
     assert one.message.startswith('This result is usable. Score 30.4')
     assert (values['seed'], values['warnings']) == ('', '')
-    poor = found_result(warnings=(), doubts=('trial 1: got a DLO in the air',))
+    poor = found_result(warnings=(), implausible=('trial 1: a DLO in the air',))
     one, values = by_name(diagnostics.result(types, poor, STAMP))['calibration']
     assert one.level == types.level(1)
-    assert one.message.startswith('Do not use this result: trial 1: got a DLO in the air. Score')
-    assert values['unusable'] == 'trial 1: got a DLO in the air'
+    assert one.message.startswith('Do not use this result: trial 1: a DLO in the air. Score')
+    assert values['unusable'] == 'trial 1: a DLO in the air'
 
 
-def test_progress_tells_the_best_so_far_and_what_is_left(types):
+def test_progress_has_the_best_so_far_and_the_time_left(types):
     best = Evaluation(0, np.array([0.25]), {'friction': 25.0}, (12.0,))
     failed = Evaluation(4, np.array([0.5]), {'friction': 50.0}, failure='diverged')
-    one, values = by_name(diagnostics.progress(
-        types, stamp=STAMP, evaluation=failed, best=best, evaluations=150, simulations_per_second=31.5,
-        seconds_left=4.6))['progress']
+    progress = SimpleNamespace(newest=failed, best=best, evaluations=150, simulations_per_second=31.5,
+                               seconds_left=4.6, spread={})
+    one, values = by_name(diagnostics.progress(types, progress, STAMP))['progress']
     assert values == {'evaluation': '5', 'evaluations': '150', 'score': 'inf', 'best_score': '12.0',
                       'best_friction': '25.0', 'simulations_per_second': '31.5', 'seconds_left': '4.6',
                       'failure': 'diverged'}
@@ -101,43 +101,34 @@ def test_progress_tells_the_best_so_far_and_what_is_left(types):
 
 @pytest.mark.parametrize(('state', 'level'), [
     ('collecting', 0), ('calibrating', 0), ('done', 0), ('failed', 2)])
-def test_status_tells_state_trials_and_refusal(types, state, level):
-    one, values = by_name(diagnostics.status(
-        types, stamp=STAMP, state=state, trials=3, last_refusal='too few', incomplete='a goal', detail='why',
-        dropped=5
-    ))['status']
-    assert values == {'state': state, 'trials': '3', 'last_refusal': 'too few', 'incomplete': 'a goal',
-                      'detail': 'why', 'dropped': '5', 'last_trial': ''}
+def test_status_has_state_trials_and_refusal(types, state, level):
+    content = {'state': state, 'trials': 3, 'last_refusal': 'too few', 'detail': 'why'}
+    one, values = by_name(diagnostics.status(types, STAMP, content, None))['status']
+    assert values == {**content, 'trials': '3', 'last_trial': ''}
     assert one.message == f'{state}: why'
     assert one.level == types.level(level)
 
 
-def test_status_tells_what_the_newest_trial_tells(types):
+def test_status_says_what_the_newest_trial_adds(types):
     told = TrialInformation('trial 2', ('flexibility', 'friction'), [0.0625, 0.25], [0.015625, 0.25])
     one, values = by_name(diagnostics.status(
-        types, stamp=STAMP, state='collecting', trials=2, information=told))[
-        'status']
+        types, STAMP, {'state': 'collecting', 'detail': ''}, told))['status']
     assert values['last_trial'] == told.words
     assert {key: float(value) for key, value in values.items() if key.startswith('std_')} == {
         'std_before_flexibility': 6.25, 'std_before_friction': 25.0,
         'std_after_flexibility': 1.5625, 'std_after_friction': 25.0}
     assert one.message == f'collecting; {told.words}'
     failed, values = by_name(diagnostics.status(
-        types, stamp=STAMP, state='failed', trials=2, detail='why',
-        information=TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
+        types, STAMP, {'state': 'failed', 'detail': 'why'},
+        TrialInformation.unknown('trial 2', ('friction',), 'it diverged')))['status']
     assert values['last_trial'] == 'the information of trial 2 is unknown: it diverged'
     assert not any(key.startswith('std_') for key in values)
     assert failed.message == 'failed: why'
-
-
-def test_status_knows_four_states(types):
-    with pytest.raises(ValueError, match='sleeping'):
-        diagnostics.status(types, stamp=STAMP, state='sleeping', trials=0)
 
 
 def test_diagnostics_cross_the_wire(types):
     travel = wire(types)
     values = result_values(travel(diagnostics.result(types, found_result(), STAMP)))
     assert values['flexibility']['value'] == 100 / 3
-    report = travel(diagnostics.status(types, stamp=STAMP, state='failed', trials=0, detail='why'))
+    report = travel(diagnostics.status(types, STAMP, {'state': 'failed', 'detail': 'why'}, None))
     assert report.status[0].level == types.level(2)

@@ -6,8 +6,8 @@
 import pytest
 
 from dlo_calibration.messages.codec import GOAL
-from dlo_calibration.ros import inbox as module
-from dlo_calibration.ros.inbox import Inbox
+from dlo_calibration.ros import calibrator_node as module
+from dlo_calibration.ros.calibrator_node import Inbox
 
 
 def dropped(numbers):

@@ -12,17 +12,17 @@ import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
-from made_up_plan import made_up_plan
+from made_up_dlo import made_up_plan
 import pytest
 from ruamel.yaml import YAML
 
 from dlo_calibration.errors import InputError
 from dlo_calibration.evaluation.evaluation import Evaluation
-from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
+from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
 from dlo_calibration.planning import PlanProgress
-from dlo_calibration.ros import diagnostics, launching, planner_diagnostics, planner_session
+from dlo_calibration.ros import diagnostics, launching, planner_session
+from dlo_calibration.workspace.worker import Progress
 
 ROOT = Path(__file__).resolve().parents[2]
 FOXGLOVE = {'calibrator': ROOT / 'config' / 'foxglove_layout.json',
@@ -133,7 +133,7 @@ def test_launch_passes_on_what_is_given_and_rviz_shows_it(node, monkeypatch):
 
 
 def test_launch_without_the_rviz_that_is_wanted_starts_nothing_and_says_so(node, monkeypatch):
-    with pytest.raises(InputError, match='rviz:=true: got no package rviz2, .*apt install'):
+    with pytest.raises(InputError, match='rviz:=true: no package rviz2; .*apt install'):
         launched(node, monkeypatch, rviz='true')
 
 
@@ -142,7 +142,7 @@ def test_launch_refuses_an_argument_that_it_does_not_know_and_lists_the_others(n
     monkeypatch.setattr(sys, 'argv', command)
     launched(node, monkeypatch)
     monkeypatch.setattr(sys, 'argv', [*command, 'tabel_height:=0.7'])
-    with pytest.raises(InputError, match='argument tabel_height, expected one of params_file, .*goal_chain'):
+    with pytest.raises(InputError, match='argument tabel_height; expected one of params_file, .*goal_chain'):
         launched(node, monkeypatch)
     monkeypatch.setattr(sys, 'argv', [*command, 'namspace:=left'])
     with pytest.raises(InputError, match=r'did you mean namespace\?'):
@@ -208,9 +208,9 @@ def test_foxglove_shows_every_panel_that_is_set_up_and_no_other(node):
 
 def test_foxglove_plots_values_that_the_node_sends():
     best = Evaluation(0, None, dict.fromkeys(PAPER_PARAMETERS, 50.0), (1.0,))
-    message = diagnostics.progress(bag_types(), stamp=1, evaluation=best, best=best, evaluations=2,
-                                   simulations_per_second=1.0, seconds_left=1.0,
-                                   spread=dict.fromkeys(PAPER_PARAMETERS, 1.0))
+    progress = Progress(2, 1)
+    progress.take(best)
+    message = diagnostics.progress(bag_types(), progress, 1)
     plotted = foxglove_plots('calibrator')
     assert plotted <= sent('progress', message)
     assert {('progress', 'progress', f'{what}_{name}') for name in PAPER_PARAMETERS
@@ -220,10 +220,8 @@ def test_foxglove_plots_values_that_the_node_sends():
 
 def test_foxglove_plots_values_that_the_planner_sends():
     types = bag_types()
-    progress = planner_diagnostics.plan_progress(types, PlanProgress(1, 10, 20, 0.01, 1.0), 1)
-    status = planner_diagnostics.planner_status(
-        types, stamp=1, state='done', detail='', missing=(), last_refusal='', description='', plans=1,
-        plan=made_up_plan())
+    progress = diagnostics.plan_progress(types, PlanProgress(1, 10, 20, 0.01, 1.0), 1)
+    status = diagnostics.planner_status(types, 1, {'state': 'done', 'detail': ''}, made_up_plan())
     plotted = foxglove_plots('planner')
     assert plotted <= sent('progress', progress) | sent('status', status)
     assert {('progress', 'progress', 'best_error_mm'), ('status', 'status', 'error_after_mm')} <= plotted

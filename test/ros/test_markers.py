@@ -6,7 +6,7 @@
 from dataclasses import replace
 import math
 
-from fitting import fitted
+from fitted import fitted
 import numpy as np
 import pytest
 from toy_messages import toy_trials, TRUTH
@@ -14,9 +14,8 @@ from toy_simulator import toy_trial, ToySimulator
 from wire import wire
 
 from dlo_calibration.model.chain import Chain
-from dlo_calibration.model.parameters import ParameterSpace
+from dlo_calibration.model.parameters import measured, ParameterSpace
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.model.quantity import measured
 from dlo_calibration.model.trial import Goal
 from dlo_calibration.ros.markers import alike, error_colour, markers, MOST_POINTS
 from dlo_calibration.search import RandomSearch

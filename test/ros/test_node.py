@@ -12,26 +12,26 @@ import subprocess
 import sys
 import time
 
-from graph import child, ended, LATCHED, PATIENCE, robot_of, TYPES, values, whole
-from live import LOG_WARN
+from live_node import LOG_WARN
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from result_message import result_values
+from ros_robot import child, ended, LATCHED, PATIENCE, robot_of, TYPES, values, whole
 from rosgraph_msgs.msg import Clock
-from serial import serial
+from toy_command import one_worker
 from toy_messages import session_messages
 from toy_simulator import ToySimulator
+from wire import result_values
 
 from dlo_calibration import InputError
-from dlo_calibration.calibration.options import declarations
+from dlo_calibration.calibration.options import Options
 from dlo_calibration.cli import main as cli
-from dlo_calibration.files.intake import OUTPUT_TYPES
 from dlo_calibration.files.result import read_result
 from dlo_calibration.files.session import read_session
-from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES
+from dlo_calibration.messages.codec import ACTION, GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.model.parameters import PAPER_PARAMETERS
-from dlo_calibration.ros.calibrator_node import CalibratorNode, spin
+from dlo_calibration.ros.calibrator_node import CalibratorNode
+from dlo_calibration.ros.graph_node import spin
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -60,7 +60,7 @@ def folders(path):
 
 def fitted(session, capsys, *flags):
     """Return the JSON of `fit` with the toy."""
-    assert cli.main(serial(['fit', session, '--json', *flags]), lambda _: ToySimulator()) == 0
+    assert cli.main(one_worker(['fit', session, '--json', *flags]), lambda _: ToySimulator()) == 0
     return json.loads(capsys.readouterr().out)
 
 
@@ -194,7 +194,7 @@ def test_starts_by_itself_after_enough_trials(start_node):
     assert whole(robot.until_result())['trials'] == '2'
 
 
-def test_notices_of_the_package_are_in_the_log_of_the_node(start_node):
+def test_warnings_of_the_package_are_in_the_log_of_the_node(start_node):
     robot = start_node()
     logging.getLogger('dlo_calibration.calibration.engines').warning('engine compiled knows no scene')
     robot.until(lambda: any(entry.msg == 'engine compiled knows no scene' and entry.level == LOG_WARN
@@ -203,7 +203,7 @@ def test_notices_of_the_package_are_in_the_log_of_the_node(start_node):
 
 def test_every_option_is_a_parameter_with_description_unit_and_range(start_node):
     node = start_node().calibrator
-    for declaration in declarations():
+    for declaration in Options.declarations():
         descriptor = node.describe_parameter(declaration.name)
         assert declaration.description in descriptor.description
         assert declaration.unit in descriptor.description
@@ -265,8 +265,9 @@ def test_signal_at_any_time_while_it_starts_ends_cleanly(ros_environment, tmp_pa
     program = (
         'import sys, pathlib; from dlo_calibration.signals import StopFlag; '
         f'stop = StopFlag(); stop.listen(); pathlib.Path({str(marker)!r}).touch(); '
-        'from dlo_calibration.ros.calibrator_node import spin; '
-        'code = spin(sys.argv[1:], stop); stop.ignore(); sys.exit(code)')
+        'from dlo_calibration.ros.calibrator_node import CalibratorNode; '
+        'from dlo_calibration.ros.graph_node import spin; '
+        "code = spin('calibrator', CalibratorNode, sys.argv[1:], stop); stop.ignore(); sys.exit(code)")
     process = subprocess.Popen(
         [sys.executable, '-c', program, '--ros-args', '-p', f'output_directory:={tmp_path}'], text=True,
         env={**ros_environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stderr=subprocess.PIPE)
@@ -310,8 +311,8 @@ def one_line(errors):
 
 
 @pytest.mark.parametrize('arguments', BAD)
-def test_bad_command_line_is_told_in_one_line_with_exit_code_2(ros_environment, arguments, capfd):
-    assert spin(['--ros-args', *arguments], lambda: False) == 2
+def test_a_bad_command_line_gives_one_line_and_exit_code_2(ros_environment, arguments, capfd):
+    assert spin('calibrator', CalibratorNode, ['--ros-args', *arguments], lambda: False) == 2
     output, errors = capfd.readouterr()
     assert output == ''
     assert one_line(errors)
@@ -324,7 +325,7 @@ def test_bad_command_line_ends_the_process(ros_environment, tmp_path):
     assert one_line(errors)
 
 
-def test_what_a_flood_drops_is_counted_and_told(start_node, tmp_path, capsys):
+def test_messages_dropped_in_a_flood_are_counted_and_reported(start_node, tmp_path, capsys):
     robot = start_node()
     initial, action, (_, goal) = session_messages(TYPES, 1)
     robot.send([initial, action, (GOAL, goal)])
@@ -344,14 +345,14 @@ def test_what_a_flood_drops_is_counted_and_told(start_node, tmp_path, capsys):
     assert f'{robot.status["dropped"]} goal_chain message(s) came faster' in capsys.readouterr().out
 
 
-def test_another_node_of_the_same_name_is_told_once_with_the_remedy(start_node, tmp_path):
+def test_another_node_of_the_same_name_is_refused_once_with_the_remedy(start_node, tmp_path):
     robot = start_node()
     first = robot.calibrator
     try:
         start_node()
-        robot.until(lambda: any('another node named /calibrator' in log.msg and '__node:=NAME' in log.msg
+        robot.until(lambda: any('another node is named /calibrator' in log.msg and '__node:=NAME' in log.msg
                                 for log in robot.heard['log']))
-        robot.until(lambda: 'another node named' in robot.status.get('last_refusal', ''))
+        robot.until(lambda: 'another node is named' in robot.status.get('last_refusal', ''))
     finally:
         first.close()
     assert len(folders(tmp_path)) == 2  # each has a session of its own

@@ -10,24 +10,22 @@ import re
 import threading
 import time
 
-from mortal import Mortal
 import pytest
-from result_message import result_values
 from toy_graph import PATIENCE, ToyGraph, TYPES, values, whole
 from toy_messages import MINUTE, session_messages, toy_trials, trial_messages
-from toy_simulator import Stoppable, ToySimulator
+from toy_simulator import CountingToy, Stoppable, ToySimulator
+from wire import result_values
 from wrong_input import with_point
 
 from dlo_calibration.calibration.engines import make_simulator
-from dlo_calibration.calibration.identity import calibration_digest
 from dlo_calibration.evaluation import EvaluationLog
 from dlo_calibration.files import recording
-from dlo_calibration.files.bag import encode
-from dlo_calibration.files.intake import OUTPUT_TYPES
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.result import read_description, read_result
 from dlo_calibration.files.session import read_session, session_trials
-from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES
-from dlo_calibration.model.quantity import number
+from dlo_calibration.messages.codec import GOAL, INITIAL, INPUT_TYPES, OUTPUT_TYPES
+from dlo_calibration.model.parameters import number
+from dlo_calibration.workspace.folder import calibration_digest
 
 pytestmark = pytest.mark.usefixtures('without_drawings', 'without_slices')
 
@@ -57,7 +55,7 @@ def score(command, folder):
     return repr(found['score'])
 
 
-def test_whatever_is_heard_is_on_the_disk_already(start, tmp_path):
+def test_published_messages_are_on_the_disk_before_a_listener_gets_them(start, tmp_path):
     class Suspicious(ToyGraph):
         def publish(self, name, octets):
             folder, = folders(tmp_path)
@@ -86,7 +84,7 @@ def test_start_without_a_complete_trial_is_refused_and_says_what_is_missing(star
     assert whole(graph.calibrated())['trials'] == '1'
 
 
-def test_what_comes_after_the_start_is_for_the_next_one(start, tmp_path, command):
+def test_messages_after_the_start_belong_to_the_next_calibration(start, tmp_path, command):
     graph = start(ToySimulator(0.002))
     graph.send(session_messages(TYPES, 1))
     graph.session.request('start')
@@ -154,7 +152,7 @@ def foreign_frame():
     (bad_cloud, ('stamp of zero', 'header.stamp')), (foreign_frame, ('camera', 'world')),
     (lambda: b'\0\1\0\0broken', ('do not decode', 'sensor_msgs/msg/PointCloud2')),
 ], ids=['stamp of zero', 'another frame', 'damaged bytes'])
-def test_what_is_refused_is_told_once_and_the_trials_stay(start, octets, words):
+def test_a_refusal_is_reported_once_and_the_trials_stay(start, octets, words):
     graph = start()
     graph.send(session_messages(TYPES, 1))
     graph.session.hear(INITIAL, octets())
@@ -176,7 +174,7 @@ def test_log_and_status_are_harmless_and_short_whatever_came(start, text):
         assert 0 < len(one) <= 300 and one.isprintable()
 
 
-def test_what_is_refused_for_one_reason_is_counted(start):
+def test_refusals_for_one_reason_are_counted(start):
     graph = start()
     bad = with_point(4, float('inf'))(TYPES)
     for k in range(37):
@@ -205,10 +203,10 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(start):
     assert graph.status['trials'] == '1'
 
 
-def test_a_trial_that_is_taken_back_is_left_out_by_the_replay_too(start, tmp_path, command):
+def test_a_discarded_trial_is_left_out_by_the_replay_too(start, tmp_path, command):
     graph = start()
     assert graph.session.request('discard_last') == (
-        False, '~/discard_last: got no trial, expected one; there is nothing to take back')
+        False, '~/discard_last: no trial; expected one; there is nothing to take back')
     graph.send(session_messages(TYPES, 2))
     assert graph.session.request('discard_last') == (True, 'trial 2 is taken back; 1 trial(s) are left')
     assert graph.status['trials'] == '1'
@@ -227,12 +225,12 @@ def test_a_trial_that_is_taken_back_is_left_out_by_the_replay_too(start, tmp_pat
     assert '6 message(s) of 2 trial(s) that were taken back are left out' in read_session(folder).problems
 
 
-def test_nothing_is_taken_back_while_it_calibrates(start):
+def test_no_trial_is_discarded_while_it_calibrates(start):
     graph = start(ToySimulator(0.01), evaluations=1000)
     graph.send(session_messages(TYPES, 1))
     assert graph.session.request('start')[0]
     done, answer = graph.session.request('discard_last')
-    assert not done and answer.startswith('~/discard_last: got a calibration under way')
+    assert not done and answer.startswith('~/discard_last: a calibration under way')
     assert graph.status['trials'] == '1'
     graph.session.request('stop')
 
@@ -303,7 +301,7 @@ def test_a_scene_that_cannot_be_used_is_refused_at_the_start(start):
     graph.send(session_messages(TYPES, 1))
     done, answer = graph.session.request('start')
     assert not done
-    assert answer.startswith('scene nowhere.urdf: got ')
+    assert answer.startswith('scene nowhere.urdf: ')
     assert (graph.status['state'], graph.status['last_refusal']) == ('collecting', answer)
 
 
@@ -313,7 +311,7 @@ def test_a_scene_that_cannot_be_used_ends_a_start_by_itself(start):
     graph.ahead += 1.0
     graph.session.tick()
     assert graph.status['state'] == 'failed'
-    assert graph.status['detail'].startswith('scene nowhere.urdf: got ')
+    assert graph.status['detail'].startswith('scene nowhere.urdf: ')
     assert graph.status['detail'] == graph.status['last_refusal']
 
 
@@ -342,7 +340,7 @@ class FullDisk:
         return self._stream.write(octets)
 
 
-def test_what_a_full_disk_cost_is_told_and_the_result_is_told_and_tried_nevertheless(
+def test_a_full_disk_is_reported_and_the_result_is_still_published(
         start, tmp_path, monkeypatch):
     full, create, replace = [], recording._create, os.replace
 
@@ -385,7 +383,7 @@ def test_what_a_full_disk_cost_is_told_and_the_result_is_told_and_tried_neverthe
     assert read_session(second).problems == ()
 
 
-def test_what_a_session_lacks_is_told_as_the_node_ends(start, tmp_path):
+def test_missing_parts_of_a_session_are_reported_when_the_node_ends(start, tmp_path):
     taken = tmp_path / 'file'
     taken.write_text('not a folder')
     graph = start(output_directory=str(taken))
@@ -554,7 +552,7 @@ def unfinished(path):
 
 def test_another_session_goes_on_with_the_same_trials_and_options(start, tmp_path):
     """Whoever sends the trials of an interrupted session again need not wait for its evaluations again."""
-    toys, results = [Mortal() for _ in range(3)], []
+    toys, results = [CountingToy() for _ in range(3)], []
     reached, going_on = threading.Event(), threading.Event()
 
     def wait():

@@ -38,7 +38,7 @@ def test_file_has_every_parameter_with_its_default(node, kind):
 
 
 @pytest.mark.parametrize('node, declaration', DECLARED, ids=lambda one: getattr(one, 'name', one))
-def test_comment_tells_meaning_unit_and_range(node, declaration):
+def test_comments_give_meaning_unit_and_range(node, declaration):
     lines = parameter_file(node).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith(f'    {declaration.name}: '))
     comment = []

@@ -3,11 +3,11 @@
 
 """Markers of a plan show its start, goal, hands and predictions with their intervals, on both wires."""
 
-from made_up_plan import made_up_plan
+from made_up_dlo import made_up_plan
 import numpy as np
 from wire import wire
 
-from dlo_calibration.ros.planner_markers import plan_markers
+from dlo_calibration.ros.markers import plan_markers
 
 STAMP = 12_500_000_000
 DELETE_ALL = 3

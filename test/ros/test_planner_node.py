@@ -11,25 +11,28 @@ import signal
 import subprocess
 import sys
 
-from graph import ended, LATCHED, robot_of, TYPES
 import numpy as np
 from planner_robot import PlannerRobot
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
+from ros_robot import ended, LATCHED, robot_of, TYPES
 from toy_planner import CHAIN, description, RESULT, ToyPlan
 
 from dlo_calibration import Chain, InputError
 from dlo_calibration.files.result import read_description, read_result, write_result
-from dlo_calibration.ros import planner
-from dlo_calibration.ros.planner_node import PlannerNode, spin
+from dlo_calibration.ros import planner_session
+from dlo_calibration.ros.executable import execute
+from dlo_calibration.ros.graph_node import spin
+from dlo_calibration.ros.planner_node import PlannerNode
 
 STRING = TYPES.find('std_msgs/msg/String')
 
 
 @pytest.fixture
-def robot(ros_environment):
-    """Give the robot."""
+def robot(ros_environment, monkeypatch):
+    """Give the robot; the node searches as `start` says."""
+    monkeypatch.setattr(planner_session, 'plan', planner_session.plan)  # restores it afterwards
     with robot_of(ros_environment, PlannerRobot) as one:
         yield one
         if one.calibrator is not None:
@@ -38,9 +41,9 @@ def robot(ros_environment):
 
 def start(robot, plan=None, remapped=(), **parameters):
     """Start the node in this process, with a search that a test makes up."""
+    planner_session.plan = plan or ToyPlan()
     robot.calibrator = PlannerNode(
-        session={'plan': plan or ToyPlan()}, context=robot.context,
-        cli_args=list(remapped),
+        context=robot.context, cli_args=list(remapped),
         parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()])
     robot.executor.add_node(robot.calibrator)
     return robot.calibrator
@@ -57,7 +60,7 @@ def listened(robot):
 def child(environment, *arguments):
     """Run the executable."""
     process = subprocess.Popen(
-        [sys.executable, '-m', 'dlo_calibration.ros.planner', '--ros-args', *arguments],
+        [sys.executable, '-m', 'dlo_calibration.ros.executable', 'planner', '--ros-args', *arguments],
         env={**environment, 'PYTHONPATH': os.pathsep.join(sys.path)}, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
@@ -114,7 +117,7 @@ def test_a_description_that_was_latched_before_is_heard_and_none_is_published(ro
     assert robot.plan()['state'] == 'done'
 
 
-def test_a_description_that_is_not_latched_is_told(robot):
+def test_a_description_that_is_not_latched_gives_a_warning(robot):
     start(robot)
     robot.node.create_publisher(STRING, '/planner/dlo_description', 1)
     robot.until(lambda: any('durability transient local' in one.msg for one in robot.heard['log']))
@@ -179,14 +182,14 @@ def test_parameters_that_cannot_be_used_are_refused_when_the_node_is_made(robot,
         start(robot, **parameters)
 
 
-def test_a_bad_command_line_is_told_in_one_line_with_exit_code_2(ros_environment, capfd):
+def test_a_bad_command_line_gives_one_line_and_exit_code_2(ros_environment, capfd):
     for arguments in (('-p', 'description:=none.xml'), ('-p', 'tolerance:=-1.0'), ('--nonsense',)):
-        assert spin(['--ros-args', *arguments], lambda: False) == 2
+        assert spin('planner', PlannerNode, ['--ros-args', *arguments], lambda: False) == 2
         output, errors = capfd.readouterr()
         line, = errors.splitlines()
         assert output == '' and line.startswith('planner: ')
 
 
 def test_help_says_how_it_is_used(capsys):
-    assert planner.main(['--help']) == 0
+    assert execute('planner', ['--help']) == 0
     assert capsys.readouterr().out.startswith('usage: planner [--ros-args')

@@ -13,8 +13,8 @@ from rclpy.context import Context  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
 
-from dlo_calibration.ros.parameters import OptionsNode  # noqa: E402
-from dlo_calibration.ros.planner_options import PlannerOptions  # noqa: E402
+from dlo_calibration.ros.graph_node import OptionsNode  # noqa: E402
+from dlo_calibration.ros.planner_session import PlannerOptions  # noqa: E402
 
 FILE = Path(__file__).resolve().parents[2] / 'config' / 'planner.yaml'
 
@@ -30,7 +30,7 @@ def node(ros_environment):
     context.try_shutdown()
 
 
-def test_a_node_starts_with_the_file_and_its_boxes_can_be_set_and_taken_back(node):
+def test_a_node_starts_with_the_file_and_its_boxes_can_be_set_and_removed(node):
     assert node.options() == PlannerOptions(tolerance=2.5)
     box = Parameter('no_go', Parameter.Type.STRING_ARRAY, ['0 0 0 1 1 1'])
     none = Parameter('no_go', Parameter.Type.BOOL_ARRAY, [])  # what `ros2 param set /planner no_go []` sends
@@ -43,10 +43,10 @@ def test_a_node_starts_with_the_file_and_its_boxes_can_be_set_and_taken_back(nod
 
 
 @pytest.mark.parametrize('name, value, words', [
-    ('reach_2', 'ring 0 0 1 2', "parameter reach_2: got 'ring 0 0 1 2', expected 'box x0 y0 z0 x1 y1 z1'"),
-    ('hands', 3, 'parameter hands: got 3, expected 1 to 2'),
-    ('mode', 'hide', "parameter mode: got 'hide', expected one of plan, publish"),
-    ('mass', 1.0, "parameter: got 'mass', expected one of ")])
+    ('reach_2', 'ring 0 0 1 2', "parameter reach_2: 'ring 0 0 1 2'; expected 'box x0 y0 z0 x1 y1 z1'"),
+    ('hands', 3, 'parameter hands: 3; expected 1 to 2'),
+    ('mode', 'hide', "parameter mode: 'hide'; expected one of plan, publish"),
+    ('mass', 1.0, "parameter: 'mass'; expected one of ")])
 def test_a_bad_value_is_refused_in_one_sentence_and_changes_nothing(node, name, value, words):
     answer = node.set_parameters_atomically([Parameter(name, value=value)])
     assert not answer.successful and answer.reason.startswith(words)

@@ -16,20 +16,22 @@ from dlo_calibration.files.result import description_document, read_result
 from dlo_calibration.messages.codec import ACTION, chain_cloud, ChainMessage, GOAL, INITIAL, read
 from dlo_calibration.messages.collector import TrialCollector
 from dlo_calibration.model.pose import Pose
-from dlo_calibration.planning.plain import plain_plan
-from dlo_calibration.ros.planner_options import PlannerOptions
+from dlo_calibration.planning.plan import plain_plan
+from dlo_calibration.ros import planner_session
+from dlo_calibration.ros.planner_session import PlannerOptions
 
 MOVED = Chain(CHAIN.points + (0.1, 0.0, 0.0))
 CAMERA = Pose([0.2, -0.1, 1.5], [0.95, 0.05, 0.02, 0.3])  # in the table's frame
 
 
 @pytest.fixture
-def started():
+def started(monkeypatch):
     """Give a function that returns a graph with a session, which it ends after the test."""
     graphs = []
 
     def start(plan=None, **options):
-        graphs.append(PlannerGraph(plan or ToyPlan(), **options))
+        monkeypatch.setattr(planner_session, 'plan', plan or ToyPlan())
+        graphs.append(PlannerGraph(**options))
         return graphs[-1]
 
     yield start
@@ -47,7 +49,7 @@ def test_status_names_what_it_waits_for(started):
             ('dlo_description', description(), 'chain goal_chain'),
             ('chain', cloud(), 'goal_chain'), ('goal_chain', cloud(), '')):
         done, answer = graph.session.request('plan')
-        assert not done and answer.startswith('~/plan: got no ') and kind in answer
+        assert not done and answer.startswith('~/plan: no ') and kind in answer
         graph.hear(kind, message)
         graph.session.tick()
         assert (graph.status['state'], graph.status['missing']) == ('waiting', missing)
@@ -156,8 +158,8 @@ def test_a_plan_without_actions_publishes_none(started, changes, words):
     assert not graph.heard['action']
 
 
-def test_a_goal_that_is_not_reached_is_a_warning_and_remarks_are_told(started):
-    graph = started(ToyPlan(remarks=('The goal is 3 % longer than the DLO.',)))
+def test_a_goal_that_is_not_reached_is_a_warning_and_its_warnings_are_logged(started):
+    graph = started(ToyPlan(warnings=('The goal is 3 % longer than the DLO.',)))
     graph.send_chains()
     assert graph.planned()['remarks'] == 'The goal is 3 % longer than the DLO.'
     assert graph.heard['status'][-1].status[0].level == 1
@@ -168,7 +170,7 @@ def test_a_stream_of_refusals_changes_the_status_at_most_once_a_second(started):
     graph = started(ToyPlan())
     graph.session.status_period, before = 1.0, len(graph.heard['status'])
     for k in range(20):
-        graph.session.refuse(f'chain stamped {k} s: got nothing')
+        graph.session.refuse(f'chain stamped {k} s: nothing')
         graph.session.tick()
     assert len(graph.heard['status']) - before <= 1
     graph.ahead += 1.0
@@ -180,7 +182,7 @@ def test_one_plan_at_a_time_and_stop_publishes_the_best_so_far(started):
     plan = ToyPlan(held=True)
     graph = started(plan)
     assert graph.session.request('stop') == (
-        False, '~/stop: got no plan under way, expected one; call ~/plan first')
+        False, '~/stop: no plan under way; expected one; call ~/plan first')
     graph.send_chains()
     assert graph.session.request('plan')[0]
     assert graph.status['state'] == 'planning'
@@ -216,9 +218,9 @@ def bad_messages():
     result = RESULT.read_text(encoding='utf-8')
     colour = result.replace('"flexibility"', '"colour"')
     return [
-        ('chain', infinite, 'chain stamped 60 s: got infinity'),
-        ('goal_chain', infinite, 'goal_chain stamped 60 s: got infinity'),
-        ('goal_chain', unstamped, 'goal_chain stamped 0 s: got a stamp of zero'),
+        ('chain', infinite, 'chain stamped 60 s: infinity'),
+        ('goal_chain', infinite, 'goal_chain stamped 60 s: infinity'),
+        ('goal_chain', unstamped, 'goal_chain stamped 0 s: a stamp of zero'),
         ('dlo_description', description('no XML'), 'dlo_description, line 1'),
         ('dlo_description', description(colour), 'dlo_description, line'),
         ('dlo_description', description(f'{result}<!--{"x" * 10**6}-->'), 'expected at most 1000000')]
@@ -245,7 +247,7 @@ def test_bytes_that_are_no_message_are_refused(started):
     graph.send_chains()
     for kind in ('chain', 'goal_chain', 'dlo_description'):
         graph.session.hear(kind, b'\x00\x01\x00\x00\xff\xff')
-        assert graph.status['last_refusal'].startswith(f'{kind}: got bytes that do not decode')
+        assert graph.status['last_refusal'].startswith(f'{kind}: bytes that do not decode')
     assert graph.planned()['state'] == 'done'
 
 
@@ -306,7 +308,7 @@ def test_the_simulation_is_that_of_the_description_unless_a_parameter_replaces_i
 
 @pytest.mark.parametrize('text', ['nodes', 'nodes=many', 'nodes=2', 'seed=3', 'table=yes', '=3'])
 def test_a_bad_option_of_the_simulation_is_refused(text):
-    with pytest.raises(InputError, match='parameter (simulation|nodes|table): got '):
+    with pytest.raises(InputError, match='parameter (simulation|nodes|table): '):
         PlannerOptions(simulation=(text,))
 
 
@@ -314,7 +316,7 @@ def test_chains_that_do_not_belong_together_are_refused_in_the_answer(started):
     graph = started()
     graph.send_chains(CHAIN, Chain(CHAIN.points * 1000))
     done, answer = graph.session.request('plan')
-    assert not done and answer.startswith('goal chain: got a length of ')
+    assert not done and answer.startswith('goal chain: a length of ')
     assert graph.status['last_refusal'] == answer
     graph.send_chains(CHAIN, Chain(CHAIN.points + (0, 0, 0.5)))
     done, answer = graph.session.request('plan')
@@ -322,7 +324,7 @@ def test_chains_that_do_not_belong_together_are_refused_in_the_answer(started):
 
 
 @pytest.mark.parametrize('error, words', [
-    (InputError('goal', 'points in the air', 'a goal on the table', 'lower it'), 'goal: got points in the'),
+    (InputError('goal', 'points in the air', 'a goal on the table', 'lower it'), 'goal: points in the'),
     (ZeroDivisionError('a defect'), 'ZeroDivisionError: a defect')])
 def test_a_plan_that_fails_says_why_and_the_next_one_works(started, error, words):
     plan = ToyPlan(error=error)

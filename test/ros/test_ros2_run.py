@@ -134,7 +134,7 @@ def test_mistaken_command_line_reaches_the_user(command, environment, tmp_path):
     done = subprocess.run([*command('calibrator'), '--ros-args', '-p', 'mas:=0.03'], cwd=tmp_path,
                           env=environment, capture_output=True, text=True)
     assert done.returncode == 2
-    assert "calibrator: parameter: got 'mas'" in done.stderr
+    assert "calibrator: parameter: 'mas'" in done.stderr
 
 
 def test_dlo_calibration_reads_the_installed_sample(command, environment, tmp_path):

@@ -8,7 +8,7 @@ import sys
 import time
 from types import ModuleType, SimpleNamespace
 
-from live import live_node, robot_types
+from live_node import live_node, robot_types
 import numpy as np
 import pytest
 from toy_messages import MINUTE, toy_trials, trial_messages
@@ -79,7 +79,7 @@ def test_what_came_before_the_name_was_set_waits_for_the_transform_too(ros_envir
 
 def test_without_tf2_a_name_is_refused_in_one_sentence(ros_environment, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'tf2_ros', None)
-    with pytest.raises(InputError, match="got the name 'table', expected the numbers x y z .* not installed"):
+    with pytest.raises(InputError, match="the name 'table'; expected the numbers x y z .* not installed"):
         with live_node(ros_environment, tmp_path, frame_pose='table'):
             pass
 
@@ -90,7 +90,7 @@ def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path
     with live_node(ros_environment, tmp_path) as robot:
         lifted = [Pose([0.0, 0.0, 0.75], [0.0, 0.0, 0.0, 1.0]).trial(trial) for trial in toy_trials(2)]
         robot.send(trial_messages(robot_types(), lifted[0], MINUTE))
-        robot.until(lambda: 'trial 1: got a DLO' in robot.status['last_refusal'], 'silence')
+        robot.until(lambda: 'trial 1: a DLO' in robot.status['last_refusal'], 'silence')
         answer, = robot.calibrator.set_parameters([Parameter('table_height', value=0.75)])
         assert answer.successful
         robot.send(trial_messages(robot_types(), lifted[1], 2 * MINUTE))
@@ -100,8 +100,8 @@ def test_a_new_table_height_counts_for_what_comes_next(ros_environment, tmp_path
 
 def test_a_stream_is_collected_anew_while_services_answer_and_a_start_waits_for_it(
         ros_environment, tmp_path, monkeypatch):
-    from graph import values
     from rclpy.parameter import Parameter
+    from ros_robot import values
 
     from dlo_calibration.ros import calibrator_node
 

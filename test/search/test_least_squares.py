@@ -3,13 +3,17 @@
 
 """What least squares promises by itself: few evaluations, the lower minimum, no pull by outliers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from dlo_calibration.calibration.calibrate import searched
+from dlo_calibration.calibration.choice import choose
 from dlo_calibration.calibration.prior import prior
-from dlo_calibration.evaluation.evaluator import Evaluator
+from dlo_calibration.calibration.setting import Setting
+from dlo_calibration.evaluation.evaluation import Evaluator
 from dlo_calibration.files.session import read_session
 from dlo_calibration.search import Hints, LeastSquares, Observation
 from dlo_calibration.simulation.compiled import CompiledSimulator
@@ -92,7 +96,7 @@ def test_a_parameter_without_effect_keeps_the_value_of_its_start():
     assert search.best[1] == 0.4
 
 
-def test_a_parameter_that_only_trembles_is_not_moved_by_chance():
+def test_a_parameter_with_only_a_random_effect_stays():
     def trembling(point):
         residuals = valley(point, flat=(1,))
         return residuals + 1e-7 * np.sin(1e6 * point[1] * np.arange(90))
@@ -144,3 +148,27 @@ def test_a_minimum_beyond_a_ridge_is_not_descended_with_the_slope_from_this_side
         assert search.best[0] == pytest.approx(0.38, abs=0.003)
         counts.append(len(asked))
     assert sum(counts) < 170
+
+
+def test_a_budget_that_ends_within_a_measurement_leaves_a_whole_model():
+    search, models = LeastSquares(3, 1), []
+    while len(points := search.ask(1)):
+        residuals = valley(points[0], roughness=0.01)
+        search.tell([Observation(points[0], float(np.sum(residuals**2)), residuals)])
+        models += [] if search.model is None else [search.model]
+    assert len(models) > 20
+    assert all(model.jacobian.any(axis=0).all() for model in models)
+
+
+@pytest.mark.parametrize('name, seed', [('object1', 19), ('object3', 10), ('object5', 2)])
+def test_a_descent_does_not_stall_in_the_valley_that_a_missing_lift_leaves(name, seed):
+    """Without the lift of trial 3, a DLO shows little more than the ratio of stiffness to friction."""
+    session = read_session(Path(__file__).resolve().parents[2] / 'msg_samples' / name)
+    trials = tuple(trial for k, trial in enumerate(session.trials) if k != 2)
+    options = choose(trials, session.options).options
+    flexibility = []
+    for one in (1, seed):
+        setting = Setting(trials, replace(options, seed=one), CompiledSimulator())
+        best = searched(setting, prior(setting.trials, setting.options)).best
+        flexibility.append(best.values['flexibility'])
+    assert flexibility[1] == pytest.approx(flexibility[0], abs=5)

@@ -109,13 +109,13 @@ def test_points_do_not_depend_on_how_the_asking_is_split(name):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_it_is_known_by_its_name_and_has_no_result_at_first(name):
+def test_a_new_search_has_its_name_and_no_result(name):
     search = SEARCHES[name](2, 0)
     assert (search.name, search.best, search.stop_reason) == (name, None, '')
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_a_search_of_which_all_fails_goes_on_to_look_elsewhere(name):
+def test_a_search_goes_on_elsewhere_if_all_its_points_fail(name):
     search, asked = walk(name, 2, 0, 40, problem=Problem(2, fails=True))
     assert np.isfinite(asked).all()
     assert len(np.unique(asked, axis=0)) == len(asked) > 10
@@ -123,7 +123,7 @@ def test_a_search_of_which_all_fails_goes_on_to_look_elsewhere(name):
 
 
 @pytest.mark.parametrize('name', MEASURED)
-def test_what_fails_is_avoided_and_the_optimum_beside_it_found(name):
+def test_a_search_avoids_failures_and_finds_the_optimum_beside_them(name):
     problem = Problem(2)
     problem.fails_below = problem.truth[0] - 0.01
     search = walk(name, 2, 1, 150, problem=problem)[0]
@@ -166,7 +166,7 @@ def test_a_hint_is_where_it_begins(name):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_hints_that_tell_nothing_change_nothing(name):
+def test_empty_hints_change_nothing(name):
     assert walk(name, 3, 1, 30)[1].tobytes() == walk(name, 3, 1, 30, hints=Hints.none(3))[1].tobytes()
 
 
@@ -184,7 +184,7 @@ def test_random_points_are_uniform_and_independent():
     assert np.abs(np.corrcoef(points.T) - np.eye(4)).max() < 0.06
 
 
-def test_the_papers_search_spends_its_budget_and_never_ends_by_itself():
+def test_the_search_of_the_paper_spends_its_whole_budget():
     search, asked = walk('random', 4, 1, 150)
     assert len(asked) == 150
     assert search.stop_reason == ''

@@ -170,7 +170,7 @@ def test_a_hollow_mesh_is_hollow(scene):
 def test_a_mesh_that_would_end_pybullet_is_refused_in_silence(scene, capfd):
     for text in ('solid nonsense', 'v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999'):
         scene(text, 'mesh.obj')
-        with pytest.raises(InputError, match="scene .*scene.urdf: got the mesh 'mesh.obj': "):
+        with pytest.raises(InputError, match="scene .*scene.urdf: the mesh 'mesh.obj': "):
             BulletSimulator(scene=scene(MESH))
     assert capfd.readouterr() == ('', '')
 
@@ -318,7 +318,7 @@ def test_a_gripper_turns_a_rope_that_resists_twist_about_its_axis(world):
 def test_a_gripper_away_from_the_rope_is_refused(world):
     rope = BulletRope.of(world, Chain(line((0, 0, 0), (1, 0, 0), 0.6, 11)), PHYSICAL)
     body = hand(world, [(0, 0, 0.2)])
-    with pytest.raises(InputError, match='a rope that is 200 mm away from it, expected at most 30 mm'):
+    with pytest.raises(InputError, match='a rope that is 200 mm away from it; expected at most 30 mm'):
         rope.grip(body, -1)
     rope.grip(body, -1, (0, 0, -0.2))
     with pytest.raises(InputError, match='held already'):

@@ -11,7 +11,7 @@ import re
 import time
 from types import MappingProxyType
 
-from carried import carried
+from carried_trials import carried
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -20,8 +20,7 @@ from random_examples import drawing
 from stepping import NO_TABLE, properties
 from test_together import CABLES, drawn, PAPERS, turned
 
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, samples, session_trials
 from dlo_calibration.simulation import core
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.core import Stop
@@ -256,7 +255,7 @@ def test_a_rope_survives_whatever_is_asked_of_it(seed, rate):
     rope = core.Rope(start(), {**CABLE, 'self_collision': 0.01}, STEP, 0.0, DOWN)
     script = clamped() if seed % 2 else core.Script([core.Event.advance([], 3), core.Event.see()], 1e-3, 5)
     acts = [
-        rope.step, rope.predict, rope.touch, rope.frame_forces, lambda: rope.state, lambda: rope.touch(True),
+        rope.step, rope.predict, rope.touch, lambda: rope.state,
         lambda: rope.hold(wild.nodes(0, 1)), lambda: rope.hold(wild.nodes(2, 3, 4)),
         lambda: rope.aim(wild.array(rope.targets)),
         lambda: rope.aim(wild.array(rope.targets), wild.array([np.eye(3).ravel()] * len(rope.held))),

@@ -13,8 +13,7 @@ from stepping import SteppedRod as Rod
 from test_rod import crumpled, energy, FREE, NONE, straight
 
 from dlo_calibration.model.parameters import ParameterSpace
-from dlo_calibration.simulation.bullet import BulletRope
-from dlo_calibration.simulation.bullet_world import pybullet
+from dlo_calibration.simulation.bullet import BulletRope, pybullet
 
 STIFFNESS, KEPT, SLIP = 1e-3, 2.0, 0.5
 

@@ -122,7 +122,7 @@ def test_more_grips_than_nodes_are_refused():
     with pytest.raises(InputError) as refusal:
         NodeLayout.of(trial(arc(), (tuple(range(1, 20)),)), 20)
     text = str(refusal.value)
-    assert text.startswith("trial 't': got 19 gripped points, expected fewer than the 20 nodes; ")
+    assert text.startswith("trial 't': 19 gripped points; expected fewer than the 20 nodes; ")
     assert len(NodeLayout.of(trial(arc(), (tuple(range(1, 20)),)), 21).places) == 21
 
 

@@ -12,7 +12,7 @@ from random_examples import drawing
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.simulation import core
-from dlo_calibration.simulation.engine import Engine
+from dlo_calibration.simulation.compiled import Engine
 from dlo_calibration.simulation.script import Settling
 
 STEP = 0.01

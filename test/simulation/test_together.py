@@ -6,18 +6,16 @@
 from concurrent.futures import CancelledError
 from dataclasses import replace
 
-from carried import carried
+from carried_trials import carried
 import numpy as np
 import pytest
 
 from dlo_calibration.errors import SimulationError
-from dlo_calibration.files.samples import samples
-from dlo_calibration.files.session import read_session, session_trials
+from dlo_calibration.files.session import read_session, samples, session_trials
 from dlo_calibration.model.action import Action, Hand
 from dlo_calibration.model.chain import Chain
 from dlo_calibration.model.parameters import ParameterSpace
 from dlo_calibration.model.trial import Goal, Trial
-from dlo_calibration.simulation import engine
 from dlo_calibration.simulation.compiled import CompiledSimulator
 from dlo_calibration.simulation.core import Stop
 from dlo_calibration.simulation.protocol import simulate_all
@@ -121,7 +119,7 @@ def test_what_was_simulated_before_makes_no_difference():
 def test_scripts_that_are_too_long_to_keep_are_written_again(rows, monkeypatch):
     jobs = [(trial, physical) for physical in drawn(CABLES, 2) for trial in (carried(0.1, 0.2), turned(1.0))]
     expected = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
-    monkeypatch.setattr(engine, 'MOST_POSITIONS', rows)
+    monkeypatch.setattr('dlo_calibration.simulation.compiled.MOST_POSITIONS', rows)
     found = simulate_all(CompiledSimulator(table=False, nodes=21), jobs, Stop())
     assert [one.chains.tobytes() for one in found] == [one.chains.tobytes() for one in expected]
 

@@ -6,7 +6,7 @@
 from itertools import count
 from types import SimpleNamespace
 
-from calibrated import straight
+from made_up_dlo import straight
 import numpy as np
 import pytest
 

@@ -21,8 +21,8 @@ from tally import Ended, Tally, verb
 from toy_messages import SECOND, session_messages, write_session
 import zstandard
 
-from dlo_calibration.files.bag import encode
-from dlo_calibration.files.recording import OUR_RECORD, SessionWriter, typestore
+from dlo_calibration.files.record import encode, typestore
+from dlo_calibration.files.recording import OUR_RECORD, SessionWriter
 from dlo_calibration.messages.codec import bag_types, chain_cloud, GOAL, INITIAL, INPUT_TYPES
 from dlo_calibration.model.chain import Chain
 
@@ -121,7 +121,7 @@ def flood(kind, count, octets=b''):
 def tiny():
     """Return the bytes of the smallest usable chain."""
     points = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
-    cloud = chain_cloud(TYPES, Chain(points), 200 * SECOND, 'world', single=True)
+    cloud = chain_cloud(TYPES, Chain(points), 200 * SECOND, 'world')
     return encode(cloud, INPUT_TYPES[INITIAL])
 
 

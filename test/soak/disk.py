@@ -106,7 +106,7 @@ def _on_verb(disk: Disk, names: tuple[str, ...], *words: object) -> tuple[list[s
     folder = disk.kept / 'out'
     there = {path.name for path in folder.iterdir()} if folder.exists() else set()
     missing = [name for name in names if name not in there]
-    refused = not out and ('folder ' in last and ': got ' in last or 'the end of calibrations.jsonl' in last)
+    refused = not out and ('; expected a place that' in last or 'the end of calibrations.jsonl' in last)
     lost = [text for text in unfinished(folder) if not text.startswith('calibrations.jsonl')]
     if not refused:
         try:
@@ -123,7 +123,7 @@ def _on_verb(disk: Disk, names: tuple[str, ...], *words: object) -> tuple[list[s
 
 def on_node(disk: Disk, session: Path) -> tuple[list[str], list[str], bool]:
     """Let the node, with the toy, record to a disk and write its result there."""
-    from graph import CHILD, robot_of, TYPES
+    from ros_robot import CHILD, robot_of, TYPES
 
     lost: list[str] = []
     graph = {'ROS_DOMAIN_ID': str(1 + os.getpid() % 101), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',

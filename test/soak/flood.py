@@ -4,6 +4,9 @@
 """
 Flood: messages from tiny to the largest that are allowed, on all topics, as fast as they can be sent.
 
+In every second burst, actions and goal chains have shuffled stamps; a late initial chain would begin another
+session.
+
 Lost: messages that the node neither recorded nor counts as dropped.  Died: a node that ends by itself, or
 not within a minute after SIGTERM.  Silence: the longest time until a request was answered.
 """
@@ -16,10 +19,10 @@ import signal
 import subprocess
 import time
 
-from domain import ros_graph
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
+from ros_domain import ros_graph
 from tally import peak_of, Tally
 from toy_messages import MINUTE, session_messages
 
@@ -42,9 +45,9 @@ QUIET = 3.0  # s without a new message in the node's count, after which all have
 
 def conduct(amount: int, seed: int, folder: Path) -> Tally:
     """Send `amount` bursts to one node, and a request after each."""
-    from graph import child, robot_of, TYPES
+    from ros_robot import child, robot_of, TYPES
 
-    tally = Tally()
+    tally, generator = Tally(), np.random.default_rng(seed)
     with ros_graph(folder) as environment, child(environment, folder / 'out') as process, \
             robot_of(environment) as robot:
         sent = 0
@@ -57,7 +60,11 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
         try:
             for k in range(amount):
                 kind, message, size = sizes[k % len(sizes)]
-                sent += _burst(robot, kind, message, min(BURST, BURST_BYTES // size), sent)
+                numbers = np.arange(sent, sent + min(BURST, BURST_BYTES // size))
+                if k % 2 and kind != INITIAL:
+                    generator.shuffle(numbers)
+                _burst(robot, kind, message, numbers.tolist())
+                sent += len(numbers)
                 begun = time.monotonic()
                 robot.call('stop')
                 tally.remember(silence=time.monotonic() - begun, peak=peak_of(process.pid))
@@ -111,13 +118,12 @@ def _messages(types):
                                   ('goal_chain', largest), (INITIAL, tiny), (ACTION, long), (INITIAL, chain))]
 
 
-def _burst(robot, kind, message, count, sent):
-    """Publish one message `count` times, each a millisecond after the one before; return `count`."""
-    for number in range(sent, sent + count):
+def _burst(robot, kind, message, numbers):
+    """Publish one message several times, stamped so many milliseconds after LATER."""
+    for number in numbers:
         message.header.stamp.sec = LATER + number // 1000
         message.header.stamp.nanosec = number % 1000 * 1_000_000
         robot.publishers[kind].publish(message)
-    return count
 
 
 def _wait(robot):

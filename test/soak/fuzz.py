@@ -15,7 +15,6 @@ import resource
 import time
 from typing import Iterator
 
-from drawings import leave_out_drawings, leave_out_slices
 from mcap.writer import CompressionType, Writer
 import pytest
 from rosbags.rosbag2 import StoragePlugin
@@ -24,12 +23,13 @@ from tally import Tally
 from toy_graph import ToyGraph
 from toy_messages import SECOND, session_messages, toy_trials, write_session
 from toy_simulator import new_toy, ToySimulator
+from without_drawings import leave_out_drawings, leave_out_slices
 from wrong_input import mutated, serialised
 
 from dlo_calibration.cli.main import main
 from dlo_calibration.errors import InputError
-from dlo_calibration.files.bag import decode, encode, Record
-from dlo_calibration.files.recording import SessionWriter, typestore
+from dlo_calibration.files.record import decode, encode, Record, typestore
+from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.files.request import Request, TrialRequest, write_request
 from dlo_calibration.files.session import read_session
 from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, read
@@ -251,12 +251,12 @@ def live(tally: Tally, dice: random.Random, folder: Path) -> None:
 def node(tally: Tally, dice: random.Random, folder: Path) -> None:
     """Publish mutated messages to a node in another process, between good ones, and let it calibrate."""
     from conftest import ros_graph
-    import graph
+    import ros_robot
 
     with ros_graph(folder) as environment, \
-            graph.child(environment, folder / 'node', '-p', 'evaluations:=4') as process, \
-            graph.robot_of(environment) as robot:
-        good = session_messages(graph.TYPES, 2)
+            ros_robot.child(environment, folder / 'node', '-p', 'evaluations:=4') as process, \
+            ros_robot.robot_of(environment) as robot:
+        good = session_messages(ros_robot.TYPES, 2)
         robot.send(good[:3])
         robot.until_status(trials='1')
         for _ in range(FLOOD):

@@ -43,7 +43,8 @@ DEMO = ('-m', 'dlo_calibration.cli.demo', '--sample', '{session}', '--output', '
 COMMANDS = (
     (4.0, ('-m', 'dlo_calibration', 'fit', '{session}', '--workers', '2', '--json', '--output', '{out}')),
     (0.9, ('-m', 'dlo_calibration', 'info', '{session}', '--json')),
-    (3.0, ('-m', 'dlo_calibration.ros.calibrator', '--ros-args', '-p', 'output_directory:="{out}"')),
+    (3.0, ('-m', 'dlo_calibration.ros.executable', 'calibrator', '--ros-args',
+           '-p', 'output_directory:="{out}"')),
     (4.0, ('-m', 'dlo_calibration', 'plot', '{session}', '{result}', '--json', '--animation',
            '--output', '{out}')),
     (6.0, ('-m', 'dlo_calibration', 'experiment', '{session}', '--json', '--runs', '1', '--search', 'random',

@@ -15,8 +15,8 @@ from pathlib import Path
 import random
 import time
 
-from domain import ros_graph
 from processes import children
+from ros_domain import ros_graph
 from tally import peak_of, Tally
 from toy_messages import session_messages
 
@@ -51,7 +51,7 @@ def conduct(amount: int, seed: int, folder: Path) -> Tally:
 @contextmanager
 def _node(folder, evaluations):
     """Give a node that has collected two trials, and its robot."""
-    from graph import child, robot_of, TYPES
+    from ros_robot import child, robot_of, TYPES
 
     folder.mkdir()
     with ros_graph(folder) as environment, child(
@@ -63,7 +63,7 @@ def _node(folder, evaluations):
 
 
 def _kill_the_node(process, robot, moment, choose, tally):
-    from graph import TYPES
+    from ros_robot import TYPES
 
     if moment == 'collecting':
         stream = (pair for k in range(TRIALS, 40) for pair in session_messages(TYPES, 1, first=k))

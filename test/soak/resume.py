@@ -22,9 +22,9 @@ import sys
 import time
 from typing import Any
 
+import counted_command
 from tally import Tally
 from toy_messages import session_messages, toy_trials, write_session
-import witness
 
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import bag_types
@@ -33,7 +33,7 @@ FULL = 14
 PATIENCE = 120.0  # s that a process may take
 MOST = 4  # kills of one calibration
 SMALL = {'nodes': 12, 'time_step': 0.01, 'settle_limit': 0.3}
-#: What is calibrated in turn; `compiled` is the toy, see `witness`.
+#: What is calibrated in turn; `compiled` is the toy, see `counted_command`.
 CHOICES: tuple[dict[str, Any], ...] = (
     {'engine': 'compiled', 'evaluations': 30},
     {'evaluations': 60},
@@ -135,7 +135,7 @@ def live(folder: Path, *words: object, limit: float | None = None) -> Life:
     begun = time.monotonic()
     with (folder / 'err').open('w+') as err:
         process = subprocess.Popen(
-            [sys.executable, witness.__file__, str(seen), *map(str, words)], stdin=subprocess.DEVNULL,
+            [sys.executable, counted_command.__file__, str(seen), *map(str, words)], stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=err, cwd=folder,
             env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)})
         end, code, usage = begun + min(limit or PATIENCE, PATIENCE), None, None
@@ -168,8 +168,8 @@ def of_node(folder: Path, tally: Tally, choose: random.Random) -> None:
     """Kill the node in a calibration; another one, which gets the same trials, must go on."""
     import functools
 
-    from graph import child, robot_of, TYPES, values, whole
-    from result_message import result_values
+    from ros_robot import child, robot_of, TYPES, values, whole
+    from wire import result_values
 
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 101), 'ROS_LOG_DIR': str(folder),
                    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}

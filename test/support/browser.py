@@ -66,10 +66,8 @@ class Tab:
 
     def place(self, pixel):
         """Return where on the screen a pixel of the photograph is."""
-        self.find('#pictures img').wait_for()
-        # The page fits a photograph into the stage in the frame after it was chosen.
-        left, top, wide, width = self.find('#pictures').evaluate("""async one => {
-            for (let k = 0; k < 2; k++) await new Promise(requestAnimationFrame);
+        self.find('#stage[aria-busy="false"]').wait_for()
+        left, top, wide, width = self.find('#pictures').evaluate("""one => {
             const box = one.getBoundingClientRect();
             return [box.left, box.top, box.width, one.offsetWidth]; }""")
         return tuple(edge + (pixel[k] + 0.5) * wide / width for k, edge in enumerate((left, top)))

@@ -21,9 +21,9 @@ import pytest
 import toy_command
 from toy_simulator import ToySimulator
 
-from dlo_calibration.capture import information
 from dlo_calibration.cli import capture
 from dlo_calibration.inference.trial_information import TrialInformation
+from dlo_calibration.page import information
 
 PATIENCE = 60.0  # s
 SIZE = 400, 300  # px: small, so that tracing takes no time

@@ -14,8 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import numpy as np
 from photographs import Sheet
 
-from dlo_calibration.capture.board import COLUMNS, PAPERS, SQUARE
-from dlo_calibration.capture.board_sheet import board_figure, BOTTOM, INCH
+from dlo_calibration.vision.board import board_figure, BOTTOM, COLUMNS, INCH, PAPERS, SQUARE
 
 FINENESS = 200  # pixels per inch of the picture of the sheet
 

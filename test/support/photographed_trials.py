@@ -8,13 +8,13 @@ from __future__ import annotations
 from contextlib import closing
 
 from dlo_calibration.capture.document import Document
-from dlo_calibration.capture.interpretation import Interpreter
 from dlo_calibration.capture.project import Project
+from dlo_calibration.capture.trials import Drafter
 
 
-def interpreted(folder, photographs, trials, dlo=None):
+def drafted(folder, photographs, trials, dlo=None):
     """
-    Return the interpretation of photographs with the board.
+    Return the drafts of photographs with the board.
 
     :param folder: of the project; a new one.
     :param photographs: name -> (content of the file, clicks (k, 2) [px]).
@@ -30,4 +30,4 @@ def interpreted(folder, photographs, trials, dlo=None):
         named = [{**trial, 'start': ids[trial['start']], 'goal': ids[trial['goal']]} for trial in trials]
         document = {'dlo': dlo or {}, 'photographs': entries, 'trials': named}
         project.change(Document.of(document), project.revision)
-        return Interpreter(project).interpret(), ids
+        return Drafter(project).draft(), ids

@@ -3,7 +3,7 @@
 
 """Robot software of a planner, on a real ROS graph."""
 
-from graph import Robot
+from ros_robot import Robot
 from toy_messages import MINUTE
 from toy_planner import CHAIN
 

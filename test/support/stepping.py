@@ -66,9 +66,10 @@ class SteppedRod:
 
     def frame_forces(self, points, times=1):
         """Return the (N, 3) [N] forces of the material frame, after so many steps at the same points."""
-        for _ in range(times):
+        for _ in range(times + 1):  # the first one only finds where the clamps hold
             self.velocities(points, np.zeros_like(points), np.zeros(3), np.zeros((len(self.rope.held), 3)))
-        return self.rope.frame_forces()
+        impulses = self.rope.state['frame_impulses']
+        return impulses / self.time_step if len(impulses) else np.zeros_like(points)
 
     def turned(self, points, axes):
         """Turn clamps by rotation vectors (3,), given by held node; what they hold stays where it is."""
@@ -116,21 +117,16 @@ class Touching:
         self._places, self._step = places, time_step
         self._physical = {
             **properties(1.0, 1.0, 1.0), 'self_collision': radius, 'friction': friction}
-        self._thorough = False
 
     def start(self, points):
         """Take the (N, 3) [m] points at the start."""
         start = core.Start(self._places, points, np.zeros_like(points))
         self.rope = core.Rope(start, self._physical, self._step, NO_TABLE, np.zeros(3))
 
-    def check_every_pair(self):
-        """Check every pair of segments in the coming steps, however far apart they are."""
-        self._thorough = True
-
     def velocities(self, points, velocities, inverse_masses, support):
         """Return the (N, 3) [m/s] velocities that contacts allow."""
         rope = self.rope
         rope.points[:], rope.predicted[:], rope.support[:] = points, velocities, support
         rope.inverse_masses[:] = inverse_masses
-        rope.touch(self._thorough)
+        rope.touch()
         return rope.predicted.copy()

@@ -17,16 +17,18 @@ def make_toy(seconds, options):
 
 
 def main():
-    """Run it, as `dlo_calibration.ros.calibrator` runs the real one."""
+    """Run it, as `dlo_calibration.ros.executable` runs the real one."""
     stop = StopFlag()
     stop.listen()
-    from drawings import leave_out_drawings, leave_out_slices
+    from without_drawings import leave_out_drawings, leave_out_slices
 
-    from dlo_calibration.ros.calibrator_node import spin
+    from dlo_calibration.ros.calibrator_node import CalibratorNode
+    from dlo_calibration.ros.graph_node import spin
 
     leave_out_drawings()
     leave_out_slices()
-    code = spin(sys.argv[2:], stop, functools.partial(make_toy, float(sys.argv[1])))
+    make_node = functools.partial(CalibratorNode, functools.partial(make_toy, float(sys.argv[1])))
+    code = spin('calibrator', make_node, sys.argv[2:], stop)
     stop.ignore()
     return code
 

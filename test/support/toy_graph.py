@@ -9,10 +9,8 @@ import time
 from toy_messages import MINUTE
 
 from dlo_calibration.calibration.options import Options
-from dlo_calibration.files.bag import encode
-from dlo_calibration.files.intake import OUTPUT_TYPES
-from dlo_calibration.files.recording import typestore
-from dlo_calibration.messages.codec import bag_types, INPUT_TYPES
+from dlo_calibration.files.record import encode, typestore
+from dlo_calibration.messages.codec import bag_types, INPUT_TYPES, OUTPUT_TYPES
 from dlo_calibration.ros.session import CalibrationSession
 
 PATIENCE = 60.0  # s
@@ -88,7 +86,7 @@ class ToyGraph(ToyNode):
         super().__init__('calibrator', INPUT_TYPES, OUTPUT_TYPES)
         self.set = {'output_directory': str(folder), 'workers': 1, 'evaluations': 30, **options}
         self.session = CalibrationSession(self, TYPES, make, self.clock)
-        self.session._outlet.status_period = status_period
+        self.session.status_period = status_period
 
     def options(self):
         return Options.of({**Options().flat(), **self.set})

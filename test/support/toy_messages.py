@@ -9,7 +9,7 @@ import numpy as np
 from toy_simulator import toy_trial
 
 from dlo_calibration import Trial
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.recording import SessionWriter
 from dlo_calibration.messages.codec import (
     ACTION,

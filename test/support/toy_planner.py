@@ -8,16 +8,15 @@ from pathlib import Path
 import threading
 import time
 
-from made_up_plan import made_up_plan
+from made_up_dlo import made_up_plan
 from toy_graph import ToyNode, TYPES
 from toy_messages import MINUTE
 
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.files.result import read_result
 from dlo_calibration.messages.codec import chain_cloud
 from dlo_calibration.planning import PlanProgress
-from dlo_calibration.ros.planner_options import PlannerOptions
-from dlo_calibration.ros.planner_session import INPUT_TYPES, OUTPUT_TYPES, PlannerSession
+from dlo_calibration.ros.planner_session import INPUT_TYPES, OUTPUT_TYPES, PlannerOptions, PlannerSession
 
 RESULT = Path(__file__).resolve().parents[2] / 'msg_samples' / 'xml' / 'dlo.xml'
 CHAIN = read_result(RESULT).chain
@@ -51,11 +50,11 @@ class ToyPlan:
 class PlannerGraph(ToyNode):
     """The graph of a planner's session, whose clock stands still unless a test moves it."""
 
-    def __init__(self, plan, **options):
+    def __init__(self, **options):
         super().__init__('planner', INPUT_TYPES, {**OUTPUT_TYPES, 'dlo_description': 'std_msgs/msg/String'})
         self.set = options
         self.decoded = 0
-        self.session = PlannerSession(self, TYPES, lambda _: None, plan=plan, clock=self.clock)
+        self.session = PlannerSession(self, TYPES, lambda _: None, clock=self.clock)
         self.session.status_period = 0.0
 
     def clock(self):

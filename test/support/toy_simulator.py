@@ -15,7 +15,7 @@ from typing import Mapping, Sequence
 import numpy as np
 
 from dlo_calibration import Action, Chain, Goal, Hand, SimulationError, Trial
-from dlo_calibration.evaluation.evaluator import mean_length
+from dlo_calibration.evaluation.evaluation import mean_length
 from dlo_calibration.model.chain import Floats
 from dlo_calibration.model.parameters import BY_NAME, ParameterSpace
 from dlo_calibration.simulation.protocol import Job, Rollout, Stop
@@ -93,6 +93,33 @@ class Deadly(ToySimulator):
                 self.file.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return super().simulate(trial, physical)
+
+
+class CountingToy(ToySimulator):
+    """
+    A toy that counts its simulations, and may end at one of them.
+
+    :param name: of the engine.
+    :param last: number of the simulation at which, and from which on, `die` is called.
+    :param counted: has one item for each simulation; engines may share it.
+    """
+
+    def __init__(self, name='toy', last=None, die=None, counted=None):
+        super().__init__(fail_below=20.0)
+        self.name, self.last, self.die = name, last, die
+        self.counted = [] if counted is None else counted
+
+    @property
+    def count(self):
+        """Number of simulations so far."""
+        return len(self.counted)
+
+    def simulate(self, trial, physical):
+        """Count, and do what the toy does; it trembles, so that the residuals need an explanation."""
+        if self.last is not None and len(self.counted) >= self.last - 1:
+            self.die()
+        self.counted.append(trial.name)
+        return super().simulate(trial, {**physical, 'friction': physical['friction'] * 1.1})
 
 
 def toy_goal(points: Floats, hands: Sequence[Hand], physical: Mapping[str, float]) -> Floats:

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The two sources of message classes, and the wire between them."""
+"""The two sources of message classes, the wire between them, and what a `result` message says."""
 
 import numpy as np
 import pytest
 
 from dlo_calibration.messages import codec
+from dlo_calibration.ros.diagnostics import WHOLE
 
 
 def graph_types():
@@ -33,3 +34,16 @@ def wire(types):
             return serialization.deserialize_message(serialization.serialize_message(message), type(message))
 
     return travel
+
+
+def result_values(message):
+    """Read the parameters of a `result` message: name -> key -> number, text or bool."""
+    found = {}
+    for one in message.status:
+        if one.name != WHOLE:
+            values = {pair.key: pair.value for pair in one.values}
+            found[one.name] = {
+                key: value == 'true' if key == 'identifiable' else
+                value if key.endswith(('unit', 'verdict', 'note')) else float(value)
+                for key, value in values.items()}
+    return found

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import numpy as np
 from toy_messages import MINUTE, SECOND, toy_trials, trial_messages
 
-from dlo_calibration.files.bag import encode
+from dlo_calibration.files.record import encode
 from dlo_calibration.messages.codec import (
     ACTION,
     action_trajectory,
@@ -55,7 +55,7 @@ class Wrong:
 
     def words(self) -> tuple[str, ...]:
         """Return what must be in its refusal."""
-        return self.kind, f'got {self.came}', f'expected {self.expected}', self.remedy
+        return self.kind, self.came, f'expected {self.expected}', self.remedy
 
 
 def good_points() -> np.ndarray:

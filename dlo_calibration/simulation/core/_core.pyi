@@ -157,15 +157,8 @@ class Rope:
     def step(self) -> bool:
         """Take a step on the table; tell whether the rope is still finite."""
 
-    def touch(self, thorough: bool = False) -> None:
-        """
-        Let self-contact change `predicted` as in a step, for tests.
-
-        :param thorough: check every pair of segments, however far apart.
-        """
-
-    def frame_forces(self) -> NDArray[np.float64]:
-        """Return the (N, 3) [N] forces of the material frame at the points of the last step, for tests."""
+    def touch(self) -> None:
+        """Let self-contact change `predicted` as in a step, for tests."""
 
     def follow(self, script: Script, step: Callable[[], Any]
                ) -> tuple[NDArray[np.float64], tuple[bool, ...], int] | None:

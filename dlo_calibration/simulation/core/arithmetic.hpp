@@ -9,7 +9,7 @@
 
 #include <cmath>
 
-#include "numbers.hpp"
+#include "rope.hpp"
 
 namespace dlo {
 namespace DLO_TARGET {
@@ -20,36 +20,31 @@ constexpr int kWidth = 4;  // doubles in a register
 constexpr int kWidth = 2;  // of SSE2 or NEON
 #endif
 constexpr int kParts = kLanes / kWidth;  // registers of a number
-using Vector = double __attribute__((vector_size(8 * kWidth), may_alias));
-using Bits = long long __attribute__((vector_size(8 * kWidth), may_alias));
+using Vector = double __attribute__((vector_size(8 * kWidth)));
+using Bits = long long __attribute__((vector_size(8 * kWidth)));
 
-/// The numbers of four DLOs: plain doubles in memory, which code for every processor may copy.
+/// The numbers of four DLOs; in memory they are plain doubles, see `in_lane`.
 struct alignas(32) Lanes {
-  double of[kLanes];
+  Vector of[kParts];
 };
 
 /// The outcome of a comparison, lane by lane.
 struct alignas(32) Mask {
-  long long of[kLanes];
+  Bits of[kParts];
 };
-
-inline Vector& part(Lanes& a, int k) { return reinterpret_cast<Vector*>(a.of)[k]; }
-inline const Vector& part(const Lanes& a, int k) { return reinterpret_cast<const Vector*>(a.of)[k]; }
-inline Bits& part(Mask& a, int k) { return reinterpret_cast<Bits*>(a.of)[k]; }
-inline const Bits& part(const Mask& a, int k) { return reinterpret_cast<const Bits*>(a.of)[k]; }
 
 // The parts one after the other, not in a loop: g++ keeps a number in registers only then.
 #define DLO_PART(number, expression) \
-  if constexpr (number < kParts) { constexpr int k = number; part(result, k) = expression; }
-#define DLO_LANEWISE(Result, expression)                                                    \
-  Result result;                                                                            \
-  DLO_PART(0, expression) DLO_PART(1, expression) DLO_PART(2, expression) DLO_PART(3, expression) \
+  if constexpr (number < kParts) { constexpr int k = number; result.of[k] = expression; }
+#define DLO_LANEWISE(Result, expression)          \
+  Result result;                                  \
+  DLO_PART(0, expression) DLO_PART(1, expression) \
   return result
 
 inline Lanes each(double x) { DLO_LANEWISE(Lanes, x - Vector{}); }
 
 #define DLO_OPERATOR(symbol, Result)                                                                \
-  inline Result operator symbol(Lanes a, Lanes b) { DLO_LANEWISE(Result, part(a, k) symbol part(b, k)); } \
+  inline Result operator symbol(Lanes a, Lanes b) { DLO_LANEWISE(Result, a.of[k] symbol b.of[k]); } \
   inline Result operator symbol(Lanes a, double b) { return a symbol each(b); }                     \
   inline Result operator symbol(double a, Lanes b) { return each(a) symbol b; }
 DLO_OPERATOR(+, Lanes)
@@ -59,12 +54,12 @@ DLO_OPERATOR(/, Lanes)
 DLO_OPERATOR(<, Mask)
 DLO_OPERATOR(>, Mask)
 #undef DLO_OPERATOR
-inline Lanes operator-(Lanes a) { DLO_LANEWISE(Lanes, -part(a, k)); }
-inline Mask operator&(Mask a, Mask b) { DLO_LANEWISE(Mask, part(a, k) & part(b, k)); }
+inline Lanes operator-(Lanes a) { DLO_LANEWISE(Lanes, -a.of[k]); }
+inline Mask operator&(Mask a, Mask b) { DLO_LANEWISE(Mask, a.of[k] & b.of[k]); }
 
 inline double select(bool choice, double a, double b) { return choice ? a : b; }
 inline Lanes select(Mask choice, Lanes a, Lanes b) {
-  DLO_LANEWISE(Lanes, part(choice, k) ? part(a, k) : part(b, k));
+  DLO_LANEWISE(Lanes, choice.of[k] ? a.of[k] : b.of[k]);
 }
 inline Lanes select(Mask choice, double a, Lanes b) { return select(choice, each(a), b); }
 inline Lanes select(Mask choice, Lanes a, double b) { return select(choice, a, each(b)); }
@@ -72,11 +67,12 @@ inline Lanes select(Mask choice, double a, double b) { return select(choice, eac
 
 inline bool any(bool mask) { return mask; }
 inline bool any(Mask mask) {
-  Bits found{};
-  for (int k = 0; k < kParts; ++k) found |= part(mask, k);
-  long long each = 0;
-  for (int k = 0; k < kWidth; ++k) each |= found[k];
-  return each != 0;
+#ifdef DLO_AVX2
+  return __builtin_ia32_movmskpd256(reinterpret_cast<Vector>(mask.of[0])) != 0;
+#else
+  const Bits either = mask.of[0] | mask.of[1];
+  return (either[0] | either[1]) != 0;
+#endif
 }
 
 // Comparisons with nan are false, so that `min(a, nan)` is a.
@@ -90,7 +86,9 @@ inline Vector sqrt(Vector x) {
   for (int k = 0; k < kWidth; ++k) x[k] = __builtin_sqrt(x[k]);  // one instruction
   return x;
 }
-inline Lanes sqrt(Lanes a) { DLO_LANEWISE(Lanes, sqrt(part(a, k))); }
+inline Lanes sqrt(Lanes a) { DLO_LANEWISE(Lanes, sqrt(a.of[k])); }
+
+
 
 template <class Number>
 inline Number abs(Number x) { return select(x < 0.0, -x, x); }

@@ -10,7 +10,7 @@
 #include <memory>
 #include <type_traits>
 
-#include "rollout.hpp"
+#include "script.hpp"
 
 #ifdef __clang__
 #pragma clang attribute push(__attribute__((target("avx2"))), apply_to = function)
@@ -21,7 +21,7 @@
 
 #define DLO_TARGET avx2
 #define DLO_AVX2
-#include "rollouts.hpp"
+#include "rollout.hpp"
 
 #ifdef __clang__
 #pragma clang attribute pop

@@ -3,7 +3,7 @@
 // Rollouts on every processor of the architecture, and the choice of the code for the one at hand.
 
 #define DLO_TARGET baseline
-#include "rollouts.hpp"
+#include "rollout.hpp"
 
 #if defined(__x86_64__)
 #include <cpuid.h>

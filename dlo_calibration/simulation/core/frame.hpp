@@ -11,8 +11,6 @@
 // those of least energy: a clamp prescribes them, free ends and pins are without torque.  Where clamps do not
 // hold the DLO (torsion 0), it turns freely as a whole, and does not twist.
 
-#include "rope.hpp"
-
 namespace dlo {
 namespace DLO_TARGET {
 

@@ -11,7 +11,7 @@
 #include <cmath>
 #include <optional>
 
-#include "rollout.hpp"
+#include "script.hpp"
 
 namespace py = pybind11;
 using namespace py::literals;
@@ -31,6 +31,10 @@ void require_finite(const char* name, double number) {
   require(std::isfinite(number), std::string(name) + ": got a number that is not finite");
 }
 
+bool all_finite(const Array& array) {
+  return std::all_of(array.data(), array.data() + array.size(), [](double x) { return std::isfinite(x); });
+}
+
 /// Rows of a kind that consists of numbers, from an array (n, ...) with as many numbers in each row.
 template <class Row>
 std::vector<Row> rows(const char* name, const Array& array, bool finite = true) {
@@ -38,9 +42,7 @@ std::vector<Row> rows(const char* name, const Array& array, bool finite = true) 
   const py::ssize_t n = array.ndim() ? array.shape(0) : 0;
   require(array.size() == n * kNumbers, std::string(name) + ": got " + std::to_string(array.size()) +
                                             " numbers, expected rows of " + std::to_string(kNumbers));
-  require(!finite || std::all_of(array.data(), array.data() + array.size(),
-                                 [](double x) { return std::isfinite(x); }),
-          std::string(name) + ": got a number that is not finite");
+  require(!finite || all_finite(array), std::string(name) + ": got a number that is not finite");
   std::vector<Row> found(n);
   std::copy_n(array.data(), array.size(), reinterpret_cast<double*>(found.data()));
   return found;
@@ -207,20 +209,13 @@ void require_fit(const Script& script, std::size_t nodes) {
   require(script.nodes <= static_cast<int>(nodes), "script: got one of a DLO of more nodes");
 }
 
-bool is_finite(const std::vector<Point>& points) {
-  return std::all_of(points.begin(), points.end(), [](const Point& one) {
-    return std::isfinite(one.x) && std::isfinite(one.y) && std::isfinite(one.z);
-  });
-}
-
 /// Nodes at the goals (g, N, 3), settled (g,), and steps; None: the rollout diverged.
 py::object answer(const Outcome& outcome) {
-  if (outcome.diverged || !std::all_of(outcome.seen.begin(), outcome.seen.end(), is_finite))
-    return py::none();
   const std::size_t nodes = outcome.seen.empty() ? 0 : outcome.seen[0].size();
   Array seen({outcome.seen.size(), nodes, std::size_t{3}});
   for (std::size_t k = 0; k < outcome.seen.size(); ++k)
     std::copy_n(&outcome.seen[k][0].x, 3 * nodes, seen.mutable_data(k, 0, 0));
+  if (outcome.diverged || !all_finite(seen)) return py::none();
   return py::make_tuple(seen, py::tuple(py::cast(outcome.settled)), outcome.steps);
 }
 
@@ -285,7 +280,8 @@ py::dict state_of(const Rope& rope) {
       "twisting"_a = array_of(rods.twisting), "angles"_a = array_of(rods.angles),
       "carried"_a = array_of(rods.carried), "joints"_a = array_of(rods.joints), "clamps"_a = clamps,
       "strands"_a = array_of(rods.strands), "plastic"_a = array_of(rods.plastic),
-      "strand_forces"_a = array_of(rods.strand_forces), "diameter"_a = rope.contact.diameter,
+      "strand_forces"_a = array_of(rods.strand_forces),
+      "frame_impulses"_a = array_of(rods.frame_impulses), "diameter"_a = rope.contact.diameter,
       "apart"_a = rope.contact.apart, "half"_a = array_of(rope.contact.half),
       "middles"_a = array_of(rope.contact.middles), "distances"_a = array_of(rope.contact.distances));
 }
@@ -323,8 +319,7 @@ void define_rope(py::module_& module) {
       .def("aim", &aim, "targets"_a, "turns"_a = py::none())
       .def("predict", [](Rope& one) { return predict(one); })
       .def("step", [](Rope& one) { return take_step(one); })
-      .def("touch", &touch, "thorough"_a = false)
-      .def("frame_forces", [](Rope& one) { return array_of(frame_forces(one)); })
+      .def("touch", &touch)
       .def("follow", &follow_script, "script"_a, "step"_a);
 }
 

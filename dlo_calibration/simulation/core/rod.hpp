@@ -15,14 +15,12 @@
 // would ring for ever); at this limit the damping depends on the time step.  The negative part of the matrix
 // of a compressed spring is left out, so that the matrix stays positive definite.
 
-#include "rods.hpp"
-
 namespace dlo {
 namespace DLO_TARGET {
 
 constexpr double kHeld = 1e12;  // weight of the equation of a held node, relative to its mass
 
-/// Find the springs of all segments first, batched, so that roots and divisions pipeline.
+/// Compute the springs of all segments in one loop, so that roots and divisions pipeline.
 template <class Number>
 inline void find_springs(Rods<Number>& rods) {
   const int segments = rods.nodes - 1;
@@ -62,9 +60,9 @@ inline void eliminate(const Column<Number>& done, const std::array<Number, kBand
 
 /// Write the equations of a step and solve them by L D L^T (Golub and Van Loan, Matrix Computations, 4.3).
 ///
-/// `right` has the impulses of other terms, `holding` what lets nodes be held; the solution is written to
-/// `predicted`, and where it is finite to `solved`.  Each column is finished at once from the six before it.
-/// The last one stays in registers, so that nothing that the next pivot waits for comes from memory.
+/// `strand_forces` and `frame_impulses` add the other internal forces, `holding` holds nodes.  The solution is
+/// written to `predicted`, and whether it is finite to `solved`.  Each column is computed in one pass from the
+/// six before it.  The last one stays in registers, so that the next pivot never waits for memory.
 template <class Number>
 inline void solve(Rods<Number>& rods) {
   const int n = rods.nodes;
@@ -183,7 +181,7 @@ inline void step_on_table(Rods<Number>& rods) {
   for (int i = 0; i < rods.nodes; ++i) {
     Vec3<Number> v = predicted[i];
     const Number distance = points[i].z - level, depth = -(distance + kSlop);
-    const Number wanted = select(depth > 0.0, 0.08 * depth / step, depth / step);  // one step corrects 8 %
+    const Number wanted = select(depth > 0.0, 0.08 * depth, depth) / step;  // one step corrects 8 %
     const Number push = wanted - v.z;
     const auto touches = (distance < margin) & (push > 0.0);
     if (any(touches)) {

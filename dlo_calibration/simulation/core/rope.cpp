@@ -199,24 +199,11 @@ bool take_step(Rope& rope) {
   return rope.rods.solved == 1.0;
 }
 
-void touch(Rope& rope, bool thorough) {
+void touch(Rope& rope) {
   Rods<double>& rods = rope.rods;
   rods.next_moves = movement(rods.predicted, rods.step);
-  if (thorough) {
-    find_near(rope.contact, rods.points.data(), 1.2, HUGE_VAL);
-    rope.contact.room_beside = rope.contact.room_away = -1.0, rope.contact.room_near = HUGE_VAL;
-  }
   avoid_self_contact(rods, rope, 0);
   rods.last_moves = movement(rods.predicted, rods.step);
-}
-
-std::vector<Point> frame_forces(Rope& rope) {
-  Rods<double>& rods = rope.rods;
-  std::vector<Point> forces(rods.nodes);
-  if (!rods.framed) return forces;
-  add_frame(rods, {&rope}, rope.frame_begun);
-  for (int i = 0; i < rods.nodes; ++i) forces[i] = 1.0 / rods.step * rods.frame_impulses[i];
-  return forces;
 }
 
 }  // namespace dlo

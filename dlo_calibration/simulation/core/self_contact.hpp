@@ -2,8 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The contact of one DLO with itself in a step.
 
-#include "rope.hpp"
-
 namespace dlo {
 namespace DLO_TARGET {
 
@@ -106,7 +104,7 @@ inline double least_gap(const Spheres& spheres, int count, int away) {
   return found;
 }
 
-/// Find how far nodes may move until any segments can touch.  All pairs are checked, which takes less time
+/// Compute how far nodes may move before any segments can touch.  All pairs are checked, which takes less time
 /// than a search that branches: near ones along the DLO by spheres around segments, the others by spheres
 /// around two segments.
 inline void find_room(SelfContact& contact, const Point* points) {
@@ -133,8 +131,7 @@ inline void find_room(SelfContact& contact, const Point* points) {
     contact.room_away = min(contact.room_away, least_gap(twin, twins, away));
 }
 
-/// Tell whether the DLO may touch itself in a step; if it must look around for that, call `look`, which
-/// returns the points.
+/// Tell whether the DLO may touch itself in a step.  `look` returns the points; it is called only if needed.
 template <class Look>
 inline bool is_near(SelfContact& contact, Movement last, Movement coming, Look look) {
   contact.room_beside -= last.neighbours;
@@ -164,7 +161,7 @@ inline bool is_near(SelfContact& contact, Movement last, Movement coming, Look l
   return !contact.near.empty();
 }
 
-/// Find those of the pairs that are near which would come too near within a step.
+/// Find the near pairs whose segments would come too close within a step.
 inline void find_contacts(SelfContact& contact, const Point* points, const Point* velocities, double step) {
   contact.contacts.clear();
   for (const auto& [i, j] : contact.near) {
@@ -180,7 +177,7 @@ inline void find_contacts(SelfContact& contact, const Point* points, const Point
   }
 }
 
-/// Find out which nodes yield, and how much.  A node does not yield to a push towards a body that supports
+/// Compute which nodes yield, and how much.  A node does not yield to a push towards a body that supports
 /// it, but passes the push on to that body: so a strand on a table carries another one.
 inline void prepare(SelfContact& contact, const double* inverse_masses, const Point* support) {
   auto& sharing = contact.change;  // x: number of contacts that share the node

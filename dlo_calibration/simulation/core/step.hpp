@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 The dlo_calibration authors
 // SPDX-License-Identifier: Apache-2.0
-// A step: each physical term in its order.
+// A step: each physical term in its order.  These headers are compiled once for each kind of processor.
 
 #include "arithmetic.hpp"
 #include "self_contact.hpp"
@@ -34,7 +34,7 @@ inline void hold(Rods<Number>& rods, const Ropes& ropes) {
   });
 }
 
-/// Let one DLO not pass through itself in the coming step.
+/// Keep one DLO from passing through itself in the coming step.
 template <class Number>
 inline void avoid_self_contact(Rods<Number>& rods, Rope& rope, int lane) {
   std::vector<Point>& points = rope.rods.points;

@@ -7,15 +7,13 @@
 // causes the moment k EI e / l, and where |e| exceeds l slip, p_i follows.  p_i turns with the DLO by the
 // smallest rotation; the nodes that turn it bear the torque, without which the element would gain energy.
 
-#include "rope.hpp"
-
 namespace dlo {
 namespace DLO_TARGET {
 
 constexpr double kHairpin = 0.01;  // least squared cosine of half an angle between segments: limits divisions
 constexpr double kAhead = 0.6;     // c of friction between strands, relative to the squared step
 
-/// By how much a vector must be multiplied so that it is not longer than `longest`.
+/// The factor that shortens a vector to the length `longest`; 1 if it is not longer.
 template <class Number>
 inline Number limited(const Vec3<Number>& v, Number longest) {
   const Number square = dot(v, v);
@@ -48,43 +46,53 @@ inline void find_strand_forces(Rods<Number>& rods, bool begun) {
   auto* bends = rods.plastic.data();
   StrandForce<Number>* forces = rods.strand_forces.data();
   const double step = rods.step, implicit = kAhead * step * step;
-  for (int i = 0; i < inner; ++i) {  // batched, so that roots and divisions pipeline
+  // Three loops, so that the processor works on several nodes at the same time.
+  for (int i = 0; i < inner; ++i) {  // the plastic bend turns with the tangent
     const Vec3<Number> chord = points[i + 2] - points[i];
-    const Number share = 1.0 / sqrt(dot(chord, chord));
-    forces[i].impulse = share * chord, forces[i].matrix[0] = share;
+    const Number inverse = 1.0 / sqrt(dot(chord, chord));
+    const Vec3<Number> tangent = inverse * chord;
+    PlasticBend<Number>& plastic = bends[i];
+    if (begun) {
+      const Number along = 2 * dot(plastic.tangent, plastic.bend);
+      const Vec3<Number> sum = plastic.tangent + tangent;
+      const Number share = dot(sum, plastic.bend) * inverse_of(dot(sum, sum)) * 2;
+      plastic.bend = plastic.bend + along * tangent - share * sum;
+    }
+    plastic.tangent = tangent;
+    forces[i].matrix[0] = inverse;
+  }
+  for (int i = 0; i < inner; ++i) {  // and follows the bend
+    const Strands<Number>& strands = all_strands[i];
+    PlasticBend<Number>& plastic = bends[i];
+    const auto& [r0, r1, r2] = strands.row;
+    const Vec3<Number> bend = r0 * points[i] + r1 * points[i + 1] + r2 * points[i + 2];
+    Vec3<Number> strain{}, coming{};
+    if (begun) {
+      strain = bend - plastic.bend;
+      coming = kAhead * (strain - plastic.strain);
+      strain = limited(strain, strands.slip) * strain;
+    }
+    plastic.bend = bend - strain, plastic.strain = strain;
+    forces[i].matrix[1] = strands.stiffness * limited(strain + coming, strands.slip);
   }
   // What the joints so far add to the next two nodes.
   const Number none{};
   Number next = none, beside_next = none, after = none;  // diagonals, and the entry below the first of them
   Vec3<Number> next_impulse{}, after_impulse{};
   for (int i = 0; i < inner; ++i) {
-    const Strands<Number> strands = all_strands[i];
-    PlasticBend<Number> plastic = bends[i];
-    const auto& [r0, r1, r2] = strands.row;
-    const Vec3<Number> bend = r0 * points[i] + r1 * points[i + 1] + r2 * points[i + 2];
-    const Vec3<Number> tangent = forces[i].impulse;
-    const Number inverse = forces[i].matrix[0];
-    Vec3<Number> strain{}, coming{};
-    if (begun) {
-      const Number along = 2 * dot(plastic.tangent, plastic.bend);
-      const Vec3<Number> sum = plastic.tangent + tangent;
-      const Number share = dot(sum, plastic.bend) * inverse_of(dot(sum, sum)) * 2;
-      strain = bend - plastic.bend - along * tangent + share * sum;
-      coming = kAhead * (strain - plastic.strain);
-      strain = limited(strain, strands.slip) * strain;
-    }
-    bends[i] = plastic = {bend - strain, tangent, strain};
-    const Number stiffness = strands.stiffness * limited(strain + coming, strands.slip);
-    const Number weight = implicit * stiffness, moment = step * stiffness;
-    strain = moment * strain;
+    const auto& [r0, r1, r2] = all_strands[i].row;
+    const auto& [bend, tangent, strain] = bends[i];
+    const Number inverse = forces[i].matrix[0], stiffness = forces[i].matrix[1];
+    const Number weight = implicit * stiffness;
+    const Vec3<Number> moment = step * stiffness * strain;
     // The plastic bend turns with the outer nodes, so that they bear the torque on it.
-    const Number along = inverse * dot(plastic.bend, tangent), share = inverse * dot(strain, tangent);
-    const Vec3<Number> torque = along * strain - share * plastic.bend;
+    const Number along = inverse * dot(bend, tangent), share = inverse * dot(moment, tangent);
+    const Vec3<Number> torque = along * moment - share * bend;
     forces[i].matrix = {next + weight * r0 * r0, beside_next + weight * r0 * r1, weight * r0 * r2};
-    forces[i].impulse = next_impulse + r0 * strain + torque;
+    forces[i].impulse = next_impulse + r0 * moment + torque;
     next = after + weight * r1 * r1, beside_next = weight * r1 * r2, after = weight * r2 * r2;
-    next_impulse = after_impulse + r1 * strain;
-    after_impulse = r2 * strain - torque;
+    next_impulse = after_impulse + r1 * moment;
+    after_impulse = r2 * moment - torque;
   }
   forces[inner] = {{next, beside_next, none}, next_impulse};
   forces[inner + 1] = {{after, none, none}, after_impulse};

@@ -1,0 +1,236 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+
+/** Step 5: the information of the trials, the calibration, its result, and the film. */
+
+import {h} from './dom.js';
+import {Film} from './film.js';
+import {button, numeric, problem, warnings} from './parts.js';
+import {resultPanel} from './result.js';
+import {counted, duration, isComponent, number, words} from './words.js';
+
+const PLACE = 'calibration';
+const MUCH = 0.4; // share of the standard deviation that remains: below, the trial shows much of a parameter
+const SOME = 0.8;
+
+export class CalibrationStep {
+  title = 'Calibrate';
+  role = 'goal';
+  evaluations = null;
+  namespace = '/calibrator';
+  sent = null; // what the node answered
+  #announced = 0;
+  #before = null;
+
+  constructor(app) {
+    this.app = app;
+    this.film = new Film(app);
+    app.project.addEventListener('change', () => this.#announce());
+  }
+
+  what() {
+    return 'The package tries parameters of a simulated DLO until it moves as yours did. Start it when every trial is complete.';
+  }
+
+  missing() {
+    const {state, document: current} = this.app.project;
+    const open = current.trials.map((one, k) => k).filter((k) => !state.trials[k]?.complete);
+    if (!current.trials.length) return ['a trial'];
+    return open.length < current.trials.length ? [] : ['a complete trial'];
+  }
+
+  done() {
+    const {result} = this.app.project.state.calibration;
+    return Boolean(result && !result.outdated);
+  }
+
+  panel() {
+    const {app} = this;
+    const {state, document: current} = app.project;
+    const {calibration} = state;
+    const busy = calibration.state === 'calibrating';
+    const trials = h(
+      'section',
+      {key: 'trials', 'aria-label': 'Trials'},
+      current.trials.map((one, k) => this.#trial(state.trials[k], k)),
+    );
+    const start = h(
+      'div.group',
+      {key: 'act'},
+      busy ? this.#progress(calibration) : this.#start(calibration),
+      problem(app.project, PLACE),
+      calibration.state === 'failed' && calibration.text
+        ? h('p.problem', {role: 'alert'}, calibration.text)
+        : null,
+    );
+    return calibration.result && !busy ? [resultPanel(this, calibration), start, trials] : [trials, start];
+  }
+
+  #trial(trial, k) {
+    if (!trial) return null;
+    const {app} = this;
+    const {information} = trial;
+    return h(
+      'div.trialcard',
+      {key: k, class: k === app.trial ? 'current' : null},
+      h(
+        'h3',
+        {},
+        `Trial ${k + 1} `,
+        h(
+          'span.verdict',
+          {class: trial.complete ? 'good' : 'bad'},
+          trial.complete ? 'complete' : 'not complete',
+        ),
+      ),
+      information
+        ? h('p', {}, information.sentence)
+        : trial.complete
+          ? h('p.note', {}, 'What it will show is being computed …')
+          : null,
+      information?.parameters
+        ? h(
+            'ul.shows',
+            {'aria-label': `What trial ${k + 1} shows`},
+            Object.entries(information.parameters).map(([name, one]) => shows(name, one.after / one.before)),
+          )
+        : null,
+      this.#warnings(k),
+    );
+  }
+
+  #warnings(k) {
+    const listed = this.app.project.state.trials[k].remarks;
+    if (k === this.app.trial) return warnings(this.app);
+    return listed.length
+      ? button(`${counted(listed.length, 'warning')}: show`, () => this.app.choose(k, 'goal'))
+      : null;
+  }
+
+  #start(calibration) {
+    const {result} = calibration;
+    const ready = !this.missing().length;
+    return h(
+      'div.group',
+      {key: 'start'},
+      result?.outdated ? h('p.problem', {}, 'The trials changed since this result: calibrate again.') : null,
+      h(
+        'div.row',
+        {},
+        button(result ? 'Calibrate again' : 'Calibrate', () => this.#calibrate(), {
+          class: result && !result.outdated ? null : 'primary',
+          disabled: !ready,
+        }),
+      ),
+      h(
+        'details',
+        {},
+        h('summary', {}, 'Options'),
+        numeric({
+          label: 'Parameter sets to try at most',
+          value: this.evaluations,
+          optional: true,
+          minimum: 1,
+          maximum: 100000,
+          step: 1,
+          placeholder: 'the usual number',
+          key: 'evaluations',
+          onset: (value) => {
+            this.evaluations = value;
+          },
+        }),
+      ),
+    );
+  }
+
+  async #calibrate() {
+    this.sent = null;
+    this.app.player.stop();
+    await this.app.project.ask('calibrate', {
+      body: this.evaluations ? {evaluations: this.evaluations} : {},
+      place: PLACE,
+    });
+  }
+
+  #progress({evaluations, of, seconds_left: left, best}) {
+    const rest =
+      of && evaluations >= of
+        ? '; the result is being examined'
+        : left === null
+          ? ''
+          : `, about ${duration(left)} left`;
+    const text = `${evaluations} of ${of || '…'} parameter sets tried${rest}`;
+    return h(
+      'div.group',
+      {key: 'progress'},
+      h('progress', {max: of || 1, value: String(evaluations), 'aria-label': 'Progress of the calibration'}),
+      h('p', {}, text),
+      best
+        ? h(
+            'p.note',
+            {},
+            `Best so far: difference ${number(best.score)}; `,
+            Object.entries(best.parameters)
+              .filter(([name]) => !isComponent(name))
+              .map(([name, value]) => `${words(name)} ${number(value)}`)
+              .join(', '),
+            ' (0 to 100)',
+          )
+        : null,
+      button('Stop, and keep the best', () => this.app.project.ask('stop', {place: PLACE})),
+    );
+  }
+
+  /** Announce each quarter of the calibration, and its end, to screen readers. */
+  #announce() {
+    const {state} = this.app.project;
+    if (!state) return;
+    const {state: now, evaluations, of, seconds_left: left} = state.calibration;
+    const quarter = now === 'calibrating' && of ? Math.floor((4 * evaluations) / of) : 0;
+    if (now === 'calibrating' && quarter > this.#announced) {
+      this.app.say(`${25 * quarter} percent${left === null ? '' : `, about ${duration(left)} left`}`);
+    }
+    if (this.#before === 'calibrating' && now !== 'calibrating') {
+      this.app.say(
+        {
+          done: 'The calibration is done',
+          stopped: 'The calibration was stopped',
+          failed: 'The calibration failed',
+        }[now] ?? '',
+      );
+      if (state.calibration.result && this.app.current === this) {
+        if (this.app.entry?.goal) this.app.role = 'goal';
+        requestAnimationFrame(() => {
+          document.getElementById('panel').scrollTop = 0;
+        });
+      }
+    }
+    this.#announced = quarter;
+    this.#before = now;
+  }
+
+  drawn() {
+    return this.film.drawn();
+  }
+
+  player() {
+    return this.film.player();
+  }
+}
+
+function shows(name, share) {
+  const [kind, text] =
+    share < MUCH ? ['good', 'much'] : share < SOME ? ['weak', 'some'] : ['bad', 'nearly nothing'];
+  return h(
+    'li',
+    {key: name},
+    h('span', {}, words(name)),
+    h('meter', {
+      min: 0,
+      max: 1,
+      value: String(Math.max(0, 1 - share)),
+      'aria-label': `What is shown of ${words(name)}`,
+    }),
+    h('span.verdict', {class: kind}, text),
+  );
+}

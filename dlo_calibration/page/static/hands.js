@@ -1,0 +1,367 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+
+/** Step 4, hands: their movements between start and goal. */
+
+import {h} from './dom.js';
+import {along, during, nearest, tableMap} from './geometry.js';
+import {stepCard} from './hand_fields.js';
+import {HANDS, labelled, letter} from './hand_names.js';
+import {line, traced} from './line.js';
+import {button, legend, mark, problem, warnings} from './parts.js';
+import {pictures} from './pictures.js';
+
+const PLACE = 'hands';
+
+export class HandsStep {
+  title = 'Hands';
+  role = 'start';
+  chosen = 0; // number of the step whose fields are open
+  adding = false;
+  #maps = new WeakMap();
+
+  constructor(app) {
+    this.app = app;
+  }
+
+  what() {
+    return 'Say what the hand did: where it gripped the DLO, how it moved, and where it opened.';
+  }
+
+  /** List [trial, role] without a movement of a hand. */
+  open() {
+    return this.app.project.document.trials.flatMap((one, k) => (one.steps.length ? [] : [[k, 'start']]));
+  }
+
+  missing() {
+    const {trials} = this.app.project.document;
+    const open = trials.flatMap((one, k) =>
+      one.steps.length ? [] : [`what the hand did in trial ${k + 1}`],
+    );
+    return trials.length ? open : ['a trial'];
+  }
+
+  done() {
+    const {trials} = this.app.project.document;
+    return trials.length > 0 && trials.every((one) => one.steps.length);
+  }
+
+  clicks() {
+    return this.app.role === 'start' ? this.#step?.kind === 'path' : this.#opening;
+  }
+
+  /** @returns {boolean} whether the chosen movement ended with an opening hand, whose place can be marked */
+  get #opening() {
+    return Boolean(this.#step && 'to' in this.#step && !this.#step.hold);
+  }
+
+  /** Show the goal photograph, in which the place is marked where the hand opened. */
+  markPlace() {
+    const {app} = this;
+    app.go(3);
+    app.choose(app.trial, 'goal');
+    if (this.#opening && !this.#step.to)
+      this.#place(this.chosen, this.#marks().find((one) => one.name === `open ${this.chosen} 0`)?.at);
+  }
+
+  #place(k, pixel, merge) {
+    const map = this.#map(this.app.role);
+    if (map && pixel)
+      this.change(
+        k,
+        (step) => {
+          step.to = map.table(pixel);
+        },
+        merge,
+      );
+  }
+
+  get #step() {
+    return this.app.entry?.steps[this.chosen];
+  }
+
+  kind(name) {
+    return this.app.project.state.actions.find((one) => one.kind === name);
+  }
+
+  panel() {
+    const {app} = this;
+    const {entry} = app;
+    if (!entry) return [h('p', {}, 'There is no trial yet: add photographs in step 1.')];
+    const {steps} = entry;
+    if (!steps.length || this.adding) return [...this.#list(steps.length), problem(app.project, PLACE)];
+    this.chosen = Math.min(this.chosen, steps.length - 1);
+    return [
+      h(
+        'p.note',
+        {},
+        app.role === 'start'
+          ? 'Drag the mark along the DLO to the point that the hand gripped.'
+          : this.#opening
+            ? 'Click where the hand opened, or drag the mark there. A DLO springs back when the hand opens, so that its point may lie elsewhere now.'
+            : 'The mark shows the gripped point at the goal.',
+      ),
+      h(
+        'ol.steplist',
+        {},
+        steps.map((step, k) => h('li', {key: k}, stepCard(this, step, k, k === this.chosen))),
+      ),
+      button('Add another movement', () => {
+        this.adding = true;
+        app.refresh();
+      }),
+      problem(app.project, PLACE),
+      warnings(app, 3),
+    ];
+  }
+
+  #list(some) {
+    return [
+      h(
+        'h3',
+        {},
+        some
+          ? 'What did a hand do next, or at the same time?'
+          : `What did the hand do in trial ${this.app.trial + 1}?`,
+      ),
+      h(
+        'ul.actions',
+        {},
+        this.app.project.state.actions.map((one) =>
+          h(
+            'li',
+            {key: one.kind},
+            h(
+              'button',
+              {type: 'button', onclick: () => this.#add(one.kind)},
+              pictures[one.kind]?.() ?? null,
+              h('span', {}, h('strong', {}, one.title), h('small', {}, one.text)),
+            ),
+          ),
+        ),
+      ),
+      some
+        ? button('Cancel', () => {
+            this.adding = false;
+            this.app.refresh();
+          })
+        : null,
+    ];
+  }
+
+  #add(kind) {
+    const {fields} = this.kind(kind);
+    const step = {kind, with_previous: false};
+    for (const [name, one] of Object.entries(fields)) step[name] = structuredClone(one.default);
+    this.adding = false;
+    this.chosen = this.app.entry.steps.length;
+    this.app.role = 'start';
+    requestAnimationFrame(() =>
+      requestAnimationFrame(() =>
+        document.querySelector('.stepcard.open')?.scrollIntoView({block: 'nearest'}),
+      ),
+    );
+    this.app.project.edit((now) => now.trials[this.app.trial].steps.push(step), {place: PLACE});
+  }
+
+  /** Change a step of the trial. */
+  change(k, change, merge) {
+    const {trial} = this.app;
+    this.app.project.edit((now) => change(now.trials[trial].steps[k], now.trials[trial].steps), {
+      merge,
+      place: PLACE,
+    });
+  }
+
+  /** @returns {Array | null} the chain in a photograph of the trial: points evenly along the DLO */
+  chain(role) {
+    const id = this.app.entry?.[role];
+    const trace = id && this.app.project.seen(id)?.trace;
+    return trace ? (trace.chain ?? trace.pixels) : null;
+  }
+
+  /** @returns {{table: Function, pixel: Function} | null} between the table and a photograph of the trial */
+  #map(role) {
+    const {project, entry} = this.app;
+    const scale = project.seen(entry[role])?.scale;
+    if (!scale) return null;
+    if (!this.#maps.has(scale)) this.#maps.set(scale, tableMap(scale.lattice));
+    return this.#maps.get(scale);
+  }
+
+  /** List the marks of a photograph: {name, at, hand, label, step, …}. */
+  #marks() {
+    const {role, entry} = this.app;
+    const chain = this.chain(role);
+    if (!chain || !entry) return [];
+    const at = (fraction) => along(chain, fraction * (chain.length - 1));
+    return entry.steps.flatMap((step, k) => {
+      const hands = step.hands ?? [step.hand];
+      const fractions = step.fractions ?? (step.fraction === undefined ? [] : [step.fraction]);
+      const found = fractions.map((fraction, i) => ({
+        name: `grip ${k} ${i}`,
+        at: at(fraction),
+        hand: hands[i],
+        fraction,
+      }));
+      if (role === 'start') {
+        const map = this.#map(role);
+        const way = (step.waypoints ?? []).map(
+          ([x, y], i) => map && {name: `way ${k} ${i}`, at: map.pixel([x, y]), hand: hands[0], way: i},
+        );
+        return [...found, ...way.filter(Boolean)];
+      }
+      if (!('to' in step) || step.hold) return found.map((one) => ({...one, fixed: true}));
+      const map = this.#map(role);
+      const to = step.to && map ? map.pixel(step.to) : found[0].at;
+      return [{...found[0], name: `open ${k} 0`, at: to, fixed: !map}];
+    });
+  }
+
+  drawn() {
+    const {app} = this;
+    const {seen, role, entry} = app;
+    const hands = app.project.state.trials[app.trial]?.hands ?? [];
+    const paths = hands.map((one, i) => [
+      one,
+      (role === 'start' ? one.start_pixels : one.goal_pixels) ?? [],
+      i,
+    ]);
+    const colour = (name) => `hand${Math.max(0, HANDS.indexOf(name)) % 2}`;
+    return [
+      ...traced(seen.trace),
+      ...paths
+        .filter(([, pixels]) => pixels.length > 1)
+        .map(([one, pixels, i]) => line(pixels, `way ${colour(one.name)}`, `path${i}`)),
+      ...this.#marks().map((one) => {
+        const given = {
+          name: one.name,
+          at: one.at,
+          kind: `${colour(one.hand)} ${one.way === undefined ? 'grip' : 'waypoint'}`,
+          text: one.way === undefined ? letter(one.hand) : String(one.way + 1),
+          label: labelled(one, entry),
+        };
+        return one.fixed
+          ? h(
+              'g.shown',
+              {key: one.name, class: given.kind, 'data-u': one.at[0], 'data-v': one.at[1]},
+              h('circle.dot', {r: 6.5}),
+              h('text', {x: 11, y: -9}, given.text),
+            )
+          : mark(given);
+      }),
+      ...(this.#moving
+        ? paths
+            .filter(([, pixels]) => pixels.length)
+            .map(([one, pixels, i]) => {
+              const [u, v] = during(one.times, pixels, app.player.time);
+              return h(
+                'g.playing',
+                {key: `playing${i}`, class: colour(one.name), 'data-u': u, 'data-v': v},
+                h('path', {d: 'M-11-26V-8Q-11 0-3 1M11-26V-8Q11 0 3 1M-11-26H11M0-26V-38'}),
+              );
+            })
+        : []),
+    ];
+  }
+
+  get #moving() {
+    return this.app.player.playing || this.app.player.time > 0;
+  }
+
+  tap(pixel) {
+    if (!this.clicks()) return;
+    if (this.app.role === 'goal') this.#place(this.chosen, pixel);
+    const map = this.app.role === 'start' ? this.#map('start') : null;
+    if (!map) return;
+    const [x, y] = map.table(pixel);
+    this.change(this.chosen, (step) => step.waypoints.push([x, y, step.waypoints.at(-1)?.[2] ?? 0]));
+  }
+
+  grab(name) {
+    const merge = `drag ${name} ${Date.now()}`;
+    const [, k] = name.split(' ').map(Number);
+    this.chosen = k;
+    this.app.refresh();
+    return {move: (pixel) => this.#moved(name, () => pixel, merge), end: () => this.app.project.settle()};
+  }
+
+  nudge(name, by) {
+    const [what, k, i] = name.split(' ');
+    if (what === 'grip') {
+      const share = (by[0] - by[1]) / 1000; // 1 press: 0.1 % of the length, with Shift 1 %
+      this.#fraction(Number(k), Number(i), (before) => before + share, `nudge ${name}`);
+    } else {
+      this.#moved(name, ([u, v]) => [u + by[0], v + by[1]], `nudge ${name}`);
+    }
+  }
+
+  press(name, key) {
+    const [what, k, i] = name.split(' ');
+    if (key !== 'Delete' && key !== 'Backspace') return false;
+    if (what === 'way') this.change(Number(k), (step) => step.waypoints.splice(Number(i), 1));
+    else if (what === 'open')
+      this.change(Number(k), (step) => {
+        step.to = null;
+      });
+    return true;
+  }
+
+  #moved(name, moved, merge) {
+    const [what, k, i] = name.split(' ');
+    const {app} = this;
+    const chain = this.chain(app.role);
+    const {at} = this.#marks().find((one) => one.name === name);
+    const pixel = moved(at);
+    if (what === 'grip') {
+      const found = nearest(chain, pixel);
+      this.#fraction(Number(k), Number(i), () => found.at / (chain.length - 1), merge);
+      return;
+    }
+    const map = this.#map(app.role);
+    const [x, y] = map.table(pixel);
+    if (what === 'way') {
+      this.change(
+        Number(k),
+        (step) => {
+          step.waypoints[Number(i)] = [x, y, step.waypoints[Number(i)][2]];
+        },
+        merge,
+      );
+      return;
+    }
+    this.#place(Number(k), pixel, merge);
+  }
+
+  #fraction(k, i, change, merge) {
+    const bounded = (value) => Math.min(1, Math.max(0, Number(value.toFixed(4))));
+    this.change(
+      k,
+      (step) => {
+        if (step.fractions) step.fractions[i] = bounded(change(step.fractions[i]));
+        else step.fraction = bounded(change(step.fraction));
+      },
+      merge,
+    );
+  }
+
+  player() {
+    const {app} = this;
+    const hands = app.project.state.trials[app.trial]?.hands ?? [];
+    const end = Math.max(0, ...hands.flatMap((one) => one.times));
+    const names = [...new Set((app.entry?.steps ?? []).flatMap((one) => one.hands ?? [one.hand]))];
+    return [
+      end > 0 && app.seen ? app.player.controls(end, 'Movement of the hands') : null,
+      legend(
+        [
+          ['sure', 'the DLO’s middle'],
+          ...names.map((name) => [
+            `mark hand${Math.max(0, HANDS.indexOf(name))} grip`,
+            `${letter(name)}: ${name.replace('_', ' ')}`,
+          ]),
+          hands.length ? ['way', 'its path'] : null,
+        ].filter(Boolean),
+      ),
+    ];
+  }
+}

@@ -1,0 +1,373 @@
+// SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+// SPDX-License-Identifier: Apache-2.0
+
+/** The page: which step, trial and photograph is shown, and what all steps share. */
+
+import {CalibrationStep} from './calibration.js';
+import {h, patch} from './dom.js';
+import {listen} from './gestures.js';
+import {HandsStep} from './hands.js';
+import {button} from './parts.js';
+import {PhotographsStep} from './photographs.js';
+import {address} from './picture.js';
+import {Player} from './player.js';
+import {Project} from './project.js';
+import {ScaleStep} from './scale.js';
+import {TraceStep} from './trace.js';
+import {View} from './view.js';
+
+const ROLES = {
+  start: 'Start',
+  goal: 'Goal',
+  start_side: 'Start from the side',
+  goal_side: 'Goal from the side',
+};
+const of = (id) => document.getElementById(id);
+
+class App {
+  project = new Project();
+  view = new View(of('stage'));
+  step = 0;
+  trial = 0;
+  role = 'start';
+  #asked = false;
+  #fit = false; // the next drawing shows the whole photograph
+
+  constructor() {
+    this.player = new Player(() => this.refresh());
+    this.steps = [
+      new PhotographsStep(this),
+      new ScaleStep(this),
+      new TraceStep(this),
+      new HandsStep(this),
+      new CalibrationStep(this),
+    ];
+    const go = (step, text) => ({step, text, act: () => this.go(step)});
+    this.remedies = {
+      // by the names that the server gives them; `step`: where its warning is shown
+      add_goal: go(0, 'Go to the photographs'),
+      add_side: go(0, 'Go to the photographs'),
+      set_scale: go(1, 'Go to the scale'),
+      add_click: go(2, 'Go to the DLO'),
+      check_length: go(2, 'Go to the DLO'),
+      more_points: go(2, 'Go to the DLO'),
+      add_step: go(3, 'Go to the hands'),
+      ask_crossings: {step: 2, text: 'Show the crossings', act: () => this.steps[2].ask()},
+      reverse_goal: {
+        step: 2,
+        text: 'Reverse the order of the goal’s clicks',
+        act: () => this.steps[2].reverse(this.entry.goal),
+      },
+      mark_place: {step: 3, text: 'Mark the place', act: () => this.steps[3].markPlace()},
+    };
+    listen(this.view, () => this.current);
+    this.project.addEventListener('change', () => this.refresh());
+    document.addEventListener('keydown', (event) => this.#keys(event));
+  }
+
+  /** Open the project, at the first step that is not done. */
+  async open() {
+    await this.project.open();
+    const first = this.steps.findIndex((one) => !one.done());
+    this.go(first < 0 ? this.steps.length - 1 : first, false);
+  }
+
+  get current() {
+    return this.steps[this.step];
+  }
+
+  /** @returns {object | undefined} the trial that is worked on */
+  get entry() {
+    return this.project.document.trials[this.trial];
+  }
+
+  /** @returns {string | null} id of the photograph that is worked on */
+  get id() {
+    return this.entry?.[this.role] ?? null;
+  }
+
+  /** @returns {object | undefined} the photograph that is worked on, as in the document */
+  get photograph() {
+    return this.id ? this.project.photograph(this.id) : undefined;
+  }
+
+  /** @returns {object | undefined} what the server knows of it */
+  get seen() {
+    return this.id ? this.project.seen(this.id) : undefined;
+  }
+
+  /** Go to a step. */
+  go(step, focus = true) {
+    this.step = step;
+    this.player.stop();
+    this.project.clear();
+    const {role} = this.current;
+    if (role && this.entry?.[role]) this.role = role;
+    this.#fit = true;
+    this.view.unsettle();
+    this.refresh();
+    if (focus)
+      requestAnimationFrame(() => {
+        of('panel').scrollTop = 0;
+        of('title')?.focus({preventScroll: true});
+      });
+  }
+
+  /** Work on a photograph of a trial. */
+  choose(trial, role) {
+    this.trial = trial;
+    this.role = role;
+    this.project.clear();
+    this.view.unsettle();
+    this.refresh();
+  }
+
+  /** List the photographs that are in trials: [trial, role, id], each id once where `once`. */
+  used(once = true) {
+    const found = [];
+    this.project.document.trials.forEach((trial, k) =>
+      Object.keys(ROLES).forEach((role) => {
+        const id = trial[role];
+        if (id && !(once && found.some((one) => one[2] === id))) found.push([k, role, id]);
+      }),
+    );
+    return found;
+  }
+
+  /** @returns {string} a photograph's place in words, such as 'goal of trial 2' */
+  placed(trial, role) {
+    return `${ROLES[role].toLowerCase()} of trial ${trial + 1}`;
+  }
+
+  /** Announce something to screen readers. */
+  say(text) {
+    of('live').textContent = text;
+  }
+
+  /** Draw everything anew, once, before the next frame. */
+  refresh() {
+    if (this.#asked) return;
+    this.#asked = true;
+    requestAnimationFrame(() => {
+      this.#asked = false;
+      this.#render();
+    });
+  }
+
+  #render() {
+    const {document: kept, state} = this.project;
+    if (!state)
+      return patch(of('panel'), [
+        h(
+          'p.what',
+          {},
+          this.project.connected
+            ? 'The project is being opened …'
+            : 'The server cannot be reached; this page keeps trying.',
+        ),
+      ]);
+    this.trial = Math.max(0, Math.min(this.trial, kept.trials.length - 1));
+    if (!this.id) this.role = this.entry?.start ? 'start' : 'goal';
+    const {current} = this;
+    patch(of('top'), this.#top());
+    of('work').hidden = this.step === 0;
+    of('main').className = this.step === 0 ? 'wide' : '';
+    patch(of('panel'), [h('div.panel', {key: current.title}, this.#panel())]);
+    if (this.step === 0) return null;
+    patch(of('strip'), this.#strip());
+    const {seen} = this;
+    this.view.show(seen ? this.id : null, seen ?? null);
+    of('stage').setAttribute(
+      'aria-label',
+      seen
+        ? `${this.photograph.name}, ${this.placed(this.trial, this.role)}. ` +
+            'Arrow keys move the photograph, plus and minus zoom, 0 shows all of it, Enter clicks in its middle, ' +
+            'Tab goes to the marks.'
+        : 'No photograph',
+    );
+    of('stage').classList.toggle('clicks', Boolean(current.clicks?.()));
+    this.view.draw(seen ? current.drawn() : [], seen ? (current.bubbles?.() ?? []) : [], seen?.trace?.pixels);
+    patch(of('tools'), this.#tools());
+    patch(of('player'), current.player?.() ?? []);
+    if (this.#fit) this.view.fit();
+    this.#fit = false;
+    this.view.settle();
+    return null;
+  }
+
+  #top() {
+    const {project} = this;
+    return [
+      h(
+        'h1',
+        {},
+        h('img', {src: 'page/icon.svg', alt: '', width: 26, height: 26}),
+        h('span', {}, 'DLO calibration'),
+        h('small', {title: project.state.folder}, project.state.folder.split('/').pop()),
+      ),
+      h(
+        'nav',
+        {'aria-label': 'Steps'},
+        h(
+          'ol.steps',
+          {},
+          this.steps.map((one, k) =>
+            h(
+              'li',
+              {},
+              h(
+                'button',
+                {
+                  type: 'button',
+                  'aria-current': k === this.step ? 'step' : null,
+                  class: one.done() ? 'done' : null,
+                  onclick: () => this.go(k),
+                },
+                h('span.number', {'aria-hidden': 'true'}, one.done() ? '✓' : String(k + 1)),
+                h('span.name', {}, one.title),
+                h('span.unseen', {}, one.done() ? ' (done)' : ' (open)'),
+              ),
+            ),
+          ),
+        ),
+      ),
+      h(
+        'div.history',
+        {},
+        button('↶', () => project.undo(), {
+          disabled: !project.canUndo,
+          'aria-label': 'Undo',
+          title: 'Undo (Ctrl+Z)',
+        }),
+        button('↷', () => project.redo(), {
+          disabled: !project.canRedo,
+          'aria-label': 'Redo',
+          title: 'Redo (Ctrl+Shift+Z)',
+        }),
+      ),
+      h(
+        'div.messages',
+        {role: 'status'},
+        project.connected
+          ? null
+          : h(
+              'p.lost',
+              {},
+              'The connection to the server is lost; this page tries again, and keeps what you do.',
+            ),
+        project.notice
+          ? h(
+              'p.notice',
+              {},
+              project.notice,
+              button('OK', () => project.clear()),
+            )
+          : null,
+        project.problem?.place === ''
+          ? h(
+              'p.problem',
+              {},
+              project.problem.text,
+              button('OK', () => project.clear()),
+            )
+          : null,
+      ),
+    ];
+  }
+
+  #panel() {
+    const {current} = this;
+    const missing = current.missing();
+    const next = this.steps[this.step + 1];
+    const open = this.#open();
+    return [
+      h('h2', {id: 'title', tabindex: -1}, `${this.step + 1} ${current.title}`),
+      h('p.what', {}, current.what()),
+      missing.length
+        ? h('div.missing', {}, h('strong', {}, 'Still missing: '), missing.join('; '), '.')
+        : null,
+      ...current.panel(),
+      h(
+        'div.onward',
+        {},
+        this.step ? button('Back', () => this.go(this.step - 1)) : null,
+        open
+          ? button(
+              `Go on: ${current.ready ? `the ${this.placed(...open)}` : `trial ${open[0] + 1}`}`,
+              () => this.choose(...open),
+              {
+                class: 'primary',
+              },
+            )
+          : null,
+        next
+          ? button(`Next: ${next.title}`, () => this.go(this.step + 1), {
+              class: missing.length ? null : 'primary',
+            })
+          : null,
+      ),
+    ];
+  }
+
+  /** @returns {[number, string] | null} the next photograph that this step needs, where the one seen is done */
+  #open() {
+    const {current} = this;
+    const open = current.ready
+      ? this.used().filter(([, , id]) => !current.ready(id))
+      : this.step && current.open
+        ? current.open()
+        : [];
+    const here = open.some(([k, , id]) => (current.ready ? id === this.id : k === this.trial));
+    return open.length && !here ? open[0].slice(0, 2) : null;
+  }
+
+  #strip() {
+    return this.project.document.trials.map((trial, k) =>
+      h(
+        'div.trial',
+        {key: k, role: 'group', 'aria-label': `Trial ${k + 1}`},
+        h('span.caption', {}, `Trial ${k + 1}`),
+        Object.keys(ROLES)
+          .filter((role) => trial[role] && (this.current.sides || !role.endsWith('side')))
+          .map((role) => {
+            const chosen = k === this.trial && role === this.role;
+            const good = this.current.ready?.(trial[role]);
+            return h(
+              'button',
+              {
+                key: role,
+                type: 'button',
+                'aria-current': chosen ? 'true' : null,
+                'aria-label': `${ROLES[role]} of trial ${k + 1}${good === undefined ? '' : good ? ', done' : ', open'}`,
+                onclick: () => this.choose(k, role),
+              },
+              h('img', {src: address(trial[role], 320), alt: '', loading: 'lazy'}),
+              h('span', {}, ROLES[role].replace('from the side', 'side'), good ? ' ✓' : ''),
+            );
+          }),
+      ),
+    );
+  }
+
+  #tools() {
+    const {view} = this;
+    return [
+      button('−', () => view.zoom(0.7), {'aria-label': 'Zoom out', title: 'Zoom out (−)'}),
+      button('+', () => view.zoom(1.4), {'aria-label': 'Zoom in', title: 'Zoom in (+)'}),
+      button('⤢', () => view.fit(), {'aria-label': 'Show the whole photograph', title: 'Show all of it (0)'}),
+    ];
+  }
+
+  #keys(event) {
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || !this.project.state) return;
+    const {target} = event;
+    if (target.matches?.('input:not([type=range], [type=checkbox], [type=radio], [type=file])')) return;
+    const key = event.key.toLowerCase();
+    if (key === 'z') event.shiftKey ? this.project.redo() : this.project.undo();
+    else if (key === 'y') this.project.redo();
+    else return;
+    event.preventDefault();
+  }
+}
+
+new App().open();

@@ -1,0 +1,306 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Studio: everything that the page can ask for, without HTTP."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+import threading
+from typing import Any, Mapping
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.capture.document import Document
+from dlo_calibration.capture.hands import described
+from dlo_calibration.capture.project import Project
+from dlo_calibration.capture.trials import Drafter, Drafts, write_request, write_session
+from dlo_calibration.errors import InputError, suggestion
+from dlo_calibration.evaluation.digest import digest
+from dlo_calibration.files.chain_file import chain_csv, chain_xml
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.page.calibration import ProjectCalibration
+from dlo_calibration.page.film import film, filmed
+from dlo_calibration.page.graph import PageGraph
+from dlo_calibration.page.information import Information
+from dlo_calibration.simulation.motion import Motion
+from dlo_calibration.vision.photograph import jpeg, png
+from dlo_calibration.workspace.folder import FILES, REQUEST, SESSION
+
+KEPT_FILMS = 8  # in memory
+CHAIN_FILES = {'csv': chain_csv, 'xml': chain_xml}
+
+
+class NotThere(InputError):
+    """Something was asked for by a name that does not exist."""
+
+
+class Studio:
+    """
+    The project of a person, its drafts, its calibration and its result; usable from any thread.
+
+    :param options: those of the command line, by name; they override those of the project.
+    :param graph: the ROS graph; None: there is no ROS here.
+    """
+
+    def __init__(self, project: Project, make_simulator: SimulatorFactory, options: Mapping[str, Any],
+                 graph: PageGraph | None) -> None:
+        self.project = project
+        self._make_simulator, self._given_options, self._graph = make_simulator, options, graph
+        self._lock = threading.RLock()
+        self._drafter = Drafter(project)
+        self._information = Information(make_simulator)
+        self._calibration = ProjectCalibration(project.folder, make_simulator, options)
+        self._films: dict[str, Motion] = {}  # the newest last
+        self._film_lock = threading.Lock()
+        self._fresh: list[str] = []  # ids of photographs that nobody has clicked on yet
+        self._newest: Drafts | None = None
+
+    # What the page draws
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the page draws."""
+        with self._lock:
+            drafts = self._drafts.plain()
+            trials = [{**trial, 'information': self._information.plain(_name(k))}
+                      for k, trial in enumerate(drafts['trials'])]
+            return {'revision': self.project.revision, 'document': self.project.document.plain(),
+                    'photographs': drafts['photographs'], 'trials': trials,
+                    'calibration': {**self.calibration(),
+                                    'result': self._calibration.plain_result(self._drafts.digest)},
+                    'lens': self.project.lens_name, 'ros': self._graph is not None,
+                    'actions': described(), 'folder': str(self.project.folder),
+                    'problems': self.project.problems}
+
+    def calibration(self) -> dict[str, Any]:
+        """Return what the page shows of the calibration, without the result."""
+        with self._lock:
+            return self._calibration.plain(self._drafts.digest)
+
+    def picture(self, identity: str, width: int | None) -> bytes:
+        """Return a photograph as a JPEG file, see `vision.photograph.jpeg`."""
+        return jpeg(self.project.photograph(self._known(identity)), width)
+
+    # What the person does
+
+    def change(self, document: Any, revision: Any) -> dict[str, Any]:
+        """
+        Take a changed document, and return the state.
+
+        :param document: plain values, of any kind.
+        :param revision: that it was made from.
+        :raises InputError: where it is refused; OldRevision where another change came before.
+        """
+        with self._lock:
+            self.project.change(Document.of(document), revision)
+            return self._changed()
+
+    def add_photograph(self, octets: bytes, name: str) -> dict[str, Any]:
+        """Take a photograph's file; return its id and the state."""
+        with self._lock:
+            identity = self.project.add_photograph(octets, name)
+            self._fresh.append(identity)
+            return {'id': identity, 'state': self._changed()}
+
+    def set_lens(self, octets: bytes, name: str) -> dict[str, Any]:
+        """Take a camera calibration, and return the state."""
+        with self._lock:
+            self.project.set_lens(octets, name)
+            return self._changed()
+
+    def remove_lens(self) -> dict[str, Any]:
+        """Forget the camera calibration, and return the state."""
+        with self._lock:
+            self.project.remove_lens()
+            return self._changed()
+
+    def calibrate(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Begin to calibrate, and return the state.
+
+        :param given: options by name; only `evaluations` and `seed`.
+        """
+        with self._lock:
+            unknown = [name for name in given if name not in ('evaluations', 'seed')]
+            if unknown:
+                raise InputError('calibration', f'an option {unknown[0]!r}', 'evaluations or seed',
+                                 suggestion(unknown[0], ('evaluations', 'seed'), 'leave it out'))
+            self._calibration.take()
+            path = self._write(SESSION, given)
+            self._information.pause()
+            self._calibration.start(path, self._drafts.digest)
+            return self.state()
+
+    def stop(self) -> dict[str, Any]:
+        """End the calibration with the best so far, and return the state."""
+        with self._lock:
+            self._calibration.stop()
+            return self.state()
+
+    # The results
+
+    def film(self, number: int, identity: str) -> dict[str, Any]:
+        """
+        Return the simulated motion of a trial, over a photograph, see `film`.
+
+        :param number: of the trial, from 0.
+        :raises InputError: where there is no result, no such trial, or no scale.
+        """
+        with self._lock:
+            drafts = self._drafts.trials
+            trial = drafts[number].trial if number < len(drafts) else None
+            if trial is None:
+                raise InputError(f'film of trial {number + 1}', 'a trial that is not complete',
+                                 'a complete trial', 'see what it lacks')
+            scale = self._drafts.photographs[self._known(identity)].scale
+            if scale is None:
+                raise InputError('film', 'a photograph without a scale', 'one with a scale',
+                                 'give it a scale first')
+            description = self._calibration.description
+            if description is None:
+                raise InputError('film', 'no result yet', 'a result', 'calibrate first')
+        with self._film_lock:  # one simulation at a time
+            key = digest(description.physical(), description.options, trial)
+            motion = self._films.pop(key, None) or filmed(trial, description, self._make_simulator)
+            self._films[key] = motion
+            if len(self._films) > KEPT_FILMS:
+                del self._films[next(iter(self._films))]
+        return film(trial, motion, scale)
+
+    def file(self, name: str) -> bytes:
+        """
+        Return a file to save: the session, the request, a file of the result, or the chain of a photograph.
+
+        :raises InputError: where there is no such file yet.
+        :raises NotThere: where no file has that name.
+        """
+        with self._lock:
+            if name in (SESSION, REQUEST):
+                return self._saved(name).read_bytes()
+            if name in FILES:
+                if name not in self._calibration.files:
+                    raise InputError(name, 'no such file yet', 'a result', 'calibrate first')
+                return (self._calibration.folder / name).read_bytes()
+            identity, _, kind = name.partition('.')
+            if kind not in CHAIN_FILES:
+                raise NotThere('file', name, 'the name of a file', 'load the page again')
+            chain = self._drafts.photographs[self._known(identity)].chain
+            if chain is None:
+                raise InputError('point chain', 'a photograph without a scale or a line', 'both',
+                                 'give it a scale and click along the DLO first')
+            return CHAIN_FILES[kind](chain)
+
+    # ROS
+
+    def topics(self) -> list[dict[str, str]]:
+        """Return name and type of each topic with images."""
+        return [] if self._graph is None else self._graph.topics()
+
+    def add_topic_image(self, topic: str) -> dict[str, Any]:
+        """Take the newest image of a topic as a photograph; return its id and the state."""
+        image = self._required_graph().image(topic)
+        octets = image.picture
+        if not isinstance(octets, bytes):
+            octets = png(octets)
+        with self._lock:
+            if image.lens is not None:
+                self.project.set_lens(image.lens, f'camera_info of {topic}')
+            return self.add_photograph(octets, topic)
+
+    def send(self, namespace: str) -> str:
+        """Send all complete trials to a running calibrator; return its answer."""
+        with self._lock:
+            trials = self._complete()
+        return self._required_graph().send(trials, namespace)
+
+    # Background work
+
+    def tick(self) -> tuple[str, ...]:
+        """Take what happened in the background; return what changed, by the names of its methods."""
+        with self._lock:
+            news = []
+            _ = self._drafts  # a project that was just opened
+            if self._fresh:
+                with suppress(InputError):
+                    self._drafter.prepare(self._fresh.pop(0))  # while the person looks at it
+            if self._calibration.take():
+                news.append('calibration' if self._calibration.busy else 'state')
+            if self._calibration.written.is_set():
+                self._calibration.written.clear()
+                news.append('state')
+            if not self._calibration.busy and self._information.take():
+                news.append('information')
+            return tuple(dict.fromkeys(news))
+
+    def information(self) -> list[dict[str, Any]]:
+        """Return the known information of each trial, with its number from 0."""
+        with self._lock:
+            known = ((k, self._information.plain(_name(k))) for k in range(len(self._drafts.trials)))
+            return [{'trial': k, **information} for k, information in known if information is not None]
+
+    def close(self) -> None:
+        """End what goes on in the background; everything else is on the disk already."""
+        with self._lock:
+            self._information.close()
+            self._calibration.close()
+            if self._graph is not None:
+                self._graph.close()
+
+    # Internals
+
+    def _changed(self) -> dict[str, Any]:
+        self._newest = None
+        return self.state()
+
+    @property
+    def _drafts(self) -> Drafts:
+        """The drafts of the present document, made when they are first needed."""
+        if self._newest is None:
+            self._newest = self._drafter.draft()
+            trials = [draft.trial for draft in self._newest.trials if draft.trial is not None]
+            self._information.want(trials, self._options({}))
+        return self._newest
+
+    def _complete(self) -> tuple[Trial, ...]:
+        """Return the complete trials, as a session has them."""
+        trials = self._drafts.complete
+        if not trials:
+            raise InputError('project', 'no complete trial', 'a start, a goal, and what the hands did',
+                             'see what the trials lack')
+        return trials
+
+    def _write(self, name: str, given: Mapping[str, Any]) -> Path:
+        """Write the session or request of the trials as they are now; return its path."""
+        path, write = self.project.folder / name, write_session if name == SESSION else write_request
+        write(path, self._complete(), self._options(given).flat())
+        return path
+
+    def _saved(self, name: str) -> Path:
+        """Write the session or request that gives `fit` the numbers of the page; return its path."""
+        shown, description = self._calibration.shown, self._calibration.description
+        unchanged = shown is not None and shown.digest == self._drafts.digest
+        return self._write(name, description.options if unchanged and description is not None else {})
+
+    def _options(self, given: Mapping[str, Any]) -> Options:
+        return Options.of({**self._drafts.options, **self._given_options, **given})
+
+    def _known(self, identity: str) -> str:
+        """
+        Return an id that is in the document.
+
+        :raises NotThere: for another one.
+        """
+        if identity not in self.project.document.by_id:
+            raise NotThere('photograph', identity, 'the id of one of the project', 'load the page again')
+        return identity
+
+    def _required_graph(self) -> PageGraph:
+        if self._graph is None:
+            raise InputError('ROS', 'no ROS 2 here', 'an installation of ROS 2 that is sourced',
+                             'source it and start the page again')
+        return self._graph
+
+
+def _name(number: int) -> str:
+    return f'trial {number + 1}'

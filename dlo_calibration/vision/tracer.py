@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tracer: finds the middle line of a DLO in a photograph, from a few rough clicks along it, and draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw
+from scipy.ndimage import gaussian_filter1d
+
+from dlo_calibration.errors import InputError
+from dlo_calibration.model.chain import Floats, frozen_array
+from dlo_calibration.vision.middle_line import arc_lengths, between_ends, evenly, fit
+from dlo_calibration.vision.path import way
+from dlo_calibration.vision.photograph import Pixels
+from dlo_calibration.vision.ridge import learn, levels
+from dlo_calibration.writing import whole
+
+NEAR_END = 40.0  # px in a photograph of 4000 px: how far from the DLO's end the first and last clicks may be
+CLICK = 16.0  # px in a photograph of 4000 px: how far beside the DLO a click may be
+SPACING = 3.0  # px between the points of a trace, in a photograph of 4000 px
+SEEN = 0.3  # share of the line that must be sure, else there is no DLO
+ABOVE = 1.35  # times as strong are the edges of the strand that lies above
+LINE, UNSURE, POINTS = (0, 220, 255), (255, 60, 0), (255, 255, 0)  # red, green, blue
+OUTLINE = (0, 0, 0)
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """
+    Where the DLO crosses itself.
+
+    :param pixel: u, v [px].
+    :param first: arc length along the trace at the first passage [px].
+    :param second: and at the second.
+    :param first_above: whether the photograph suggests that the first is above; None: it does not show it.
+    """
+
+    pixel: tuple[float, float]
+    first: float
+    second: float
+    first_above: bool | None
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """
+    The middle line of a DLO, from the first click's end to the last one's.
+
+    :param pixels: (n, 2) [px], evenly, u to the right and v down from the middle of the upper left pixel.
+    :param sure: (n,) False where the line is hidden or ambiguous.
+    :param width: median width of the DLO [px].
+    :param crossings: where the DLO crosses itself, in the order of their first passage.
+    """
+
+    pixels: Floats
+    sure: NDArray[np.bool_]
+    width: float
+    crossings: tuple[Crossing, ...]
+
+
+class Tracer:
+    """
+    Traces DLOs in one photograph.
+
+    :param pixels: (height, width, 3) uint8 RGB.
+    """
+
+    def __init__(self, pixels: NDArray[np.uint8]) -> None:
+        self._pixels = np.ascontiguousarray(pixels)
+        self._levels = levels(self._pixels)
+
+    def trace(self, clicks: ArrayLike, *, width: float | None = None) -> Trace:
+        """
+        Trace the DLO along clicks.
+
+        The line ends at the DLO's end if the first or last click is near one, else at the click.
+
+        :param clicks: (k, 2) [px], k >= 2, in order along the DLO, each at most some 16 px beside it.
+        :param width: of the DLO [px], if it is known.
+        :raises InputError: if there are fewer than two clicks, one is outside the photograph, or there is no
+            DLO along them.
+        """
+        places = self._checked(clicks)
+        scale = max(self._pixels.shape[:2]) / 4000
+        ridge = learn(self._levels, places, width)
+        rough = way(ridge, places, max(CLICK * scale, 3.0))
+        if len(rough) < 2:
+            raise _nothing()
+        near = max(NEAR_END * scale, 2 * ridge.width)
+        middle = fit(self._pixels, rough, ridge.width if width is None else width, width is not None, near)
+        line, sure, strength = between_ends(self._pixels, middle, places, NEAR_END * scale,
+                                            max(SPACING * scale, 1.0))
+        if len(line) < 3 or sure.mean() < SEEN:
+            raise _nothing()
+        size = 2 * float(np.median(middle.half))
+        return Trace(frozen_array(line), frozen_array(sure, bool), size,
+                     tuple(_crossings(line, strength, size)))
+
+    def _checked(self, clicks: ArrayLike) -> Floats:
+        places = np.asarray(clicks, dtype=float)
+        if places.ndim != 2 or places.shape[1:] != (2,) or len(places) < 2:
+            raise InputError('clicks', f'an array of shape {places.shape}', 'two or more pixels u,v',
+                             'click on both ends of the DLO, and on its bends')
+        height, width = self._pixels.shape[:2]
+        outside = ~((places > -1) & (places < (width, height))).all(axis=1)
+        if outside.any():
+            k = int(np.argmax(outside))
+            raise InputError(f'click {k + 1}', f'{places[k][0]:g},{places[k][1]:g}',
+                             f'a pixel of the photograph, which is {width} x {height}',
+                             'click on the DLO in the photograph')
+        kept = np.concatenate([[True], np.linalg.norm(np.diff(places, axis=0), axis=1) > 1])
+        if kept.sum() < 2:
+            raise InputError('clicks', 'all at one place', 'at least two places',
+                             'click on both ends of the DLO')
+        inside: Floats = np.clip(places[kept], 0, (width - 1, height - 1))
+        return inside
+
+
+def _nothing() -> InputError:
+    return InputError('clicks', 'nothing along them that looks the same from end to end', 'clicks on a DLO',
+                      'click on both ends of the DLO, and on its bends, in order')
+
+
+def _crossings(line: Floats, strength: Floats, width: float) -> list[Crossing]:
+    """List where a line (n, 2) crosses itself."""
+    arc = arc_lengths(line)
+    coarse = evenly(line, max(width / 3, arc[-1] / 600))
+    steps = np.diff(coarse, axis=0)
+    at = arc_lengths(coarse) * (arc[-1] / max(float(arc_lengths(coarse)[-1]), 1e-9))
+    gaps = coarse[None, :-1] - coarse[:-1, None]  # from the start of i to the start of j
+    turns = steps[:, None, 0] * steps[None, :, 1] - steps[:, None, 1] * steps[None, :, 0]
+    turns = np.where(np.abs(turns) < 1e-12, 1e-12, turns)
+    of_first = (gaps[..., 0] * steps[None, :, 1] - gaps[..., 1] * steps[None, :, 0]) / turns
+    of_second = (gaps[..., 0] * steps[:, None, 1] - gaps[..., 1] * steps[:, None, 0]) / turns
+    meets = (of_first >= 0) & (of_first < 1) & (of_second >= 0) & (of_second < 1)
+    index = np.arange(len(steps))
+    smooth = gaussian_filter1d(strength, 1.0)
+    crossings = []
+    for i, j in np.argwhere(meets & (index[None] > index[:, None] + 2)):
+        first = float(at[i] + of_first[i, j] * (at[i + 1] - at[i]))
+        second = float(at[j] + of_second[i, j] * (at[j + 1] - at[j]))
+        sine = abs(float(turns[i, j])) / float(np.linalg.norm(steps[i]) * np.linalg.norm(steps[j]))
+        reach = 0.35 * width / max(sine, 0.4)
+        ways = [float(smooth[np.abs(arc - place) <= reach].mean()) for place in (first, second)]
+        above = None if max(ways) < ABOVE * min(ways) else ways[0] > ways[1]
+        u, v = coarse[i] + of_first[i, j] * steps[i]
+        crossings.append(Crossing((float(u), float(v)), first, second, above))
+    return crossings
+
+
+def write_picture(path: Path, pixels: Pixels, trace: Trace, points: Floats | None = None) -> None:
+    """
+    Write a photograph as PNG with its line; unsure parts have another colour.
+
+    :param points: (n, 2) [px] of the chain's points, which become dots; None: there are none.
+    :raises InputError: where the file cannot be written.
+    """
+    image = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(image)
+    thick = max(round(trace.width / 6), 2)
+    for colour, width in ((OUTLINE, thick + 2), (None, thick)):
+        for begin, end, sure in zip(trace.pixels[:-1], trace.pixels[1:], trace.sure[:-1], strict=True):
+            draw.line([*begin.tolist(), *end.tolist()], colour or (LINE if sure else UNSURE), width)
+    for u, v in np.zeros((0, 2)) if points is None else points:
+        draw.ellipse([u - thick, v - thick, u + thick, v + thick], POINTS, OUTLINE)
+    with whole(path) as new, new.open('wb') as stream:
+        image.save(stream, 'PNG', compress_level=1)

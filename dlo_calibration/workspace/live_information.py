@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""LiveInformation: how much each new trial adds, computed in the background before a calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from concurrent.futures import CancelledError
+from contextlib import closing
+import queue
+from typing import Callable, Iterator, Optional, Sequence, Union
+
+import numpy as np
+
+from dlo_calibration.calibration.choice import choose
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.options import Options
+from dlo_calibration.calibration.prior import prior
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.errors import one_line
+from dlo_calibration.evaluation.digest import digest
+from dlo_calibration.evaluation.evaluation import mean_length
+from dlo_calibration.evaluation.pool import Pool, Threads
+from dlo_calibration.inference.trial_information import (
+    Appraisal,
+    Appraiser,
+    TrialInformation,
+    without_repeated_goals,
+)
+from dlo_calibration.model.trial import Trial
+from dlo_calibration.observation.material import with_shared_places
+from dlo_calibration.observation.noise import noise
+from dlo_calibration.observation.plausibility import implausible
+from dlo_calibration.workspace.worker import Background
+
+#: fingerprints -> the appraisal after these trials; or why the last one could not be appraised
+_Known = dict[tuple[tuple[str, int], ...], Union[Appraisal, str]]
+
+
+class LiveInformation(Background[Optional[TrialInformation]]):
+    """
+    Appraises trials in a thread of its own: it computes the information that each of them adds.
+
+    A trial is simulated again only after the trial, the options or the last result have changed.
+
+    :param make_simulator: makes the engine; called in the thread.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory) -> None:
+        super().__init__('appraisal')
+        self._make_simulator = make_simulator
+        # `_known` is valid for these options and this result
+        self._base: tuple[Options, CalibrationResult | None] | None = None
+        self._known: _Known = {}
+
+    def start(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None = None,
+              whole: bool = True) -> None:
+        """
+        Begin to appraise the trials that are new, and return immediately.
+
+        :param result: of the last calibration, whose trials are not appraised again; it is ignored if it has
+            other parameters.
+        :param whole: whether the last trial is complete; if not, it is left out unless it ends at rest.
+        :raises DloCalibrationError: while another appraisal is under way.
+        """
+        if not whole and trials and not trials[-1].goals[-1].stable:
+            trials = trials[:-1]
+        options = choose(trials, options).options
+        if result is not None and result.space != options.space:
+            result = None
+        if self._base is None or self._base[0] != options or self._base[1] is not result:
+            self._base, self._known = (options, result), {}
+        known, put = self._known, self.events.put
+
+        def work(should_stop: Callable[[], bool]) -> None:
+            try:
+                self._appraise(tuple(trials), options, result, known, put, should_stop)
+            except CancelledError:
+                pass
+            except Exception as error:  # an appraisal never disturbs the node
+                put(TrialInformation.unknown(trials[-1].name, options.space.free, one_line(error)))
+
+        self.begin(work)
+
+    def stop(self) -> None:
+        """End the appraisal under way, delete its results, and return immediately."""
+        super().stop()
+        self.events, self._base = queue.SimpleQueue(), None
+
+    def waiting_information(self) -> Iterator[TrialInformation]:
+        """Yield the results so far, without waiting for more."""
+        return (event for event in self.waiting_events() if isinstance(event, TrialInformation))
+
+    def _appraise(self, trials: Sequence[Trial], options: Options, result: CalibrationResult | None,
+                  informations: _Known, put: Callable[[TrialInformation], None],
+                  should_stop: Callable[[], bool]) -> None:
+        space, height = options.space, options.table_top
+        examination = None if result is None else result.examination
+        done = fingerprints(result.trials) if result and examination and examination.regular else []
+        keys = fingerprints(trials)
+        new = [(k, tuple(keys[:k + 1])) for k, key in enumerate(keys) if key not in done]
+        if all(key in informations for _, key in new):
+            return
+        trials = with_shared_places(trials)
+        start, default = prior(trials, options).hints.start, space.default_point()
+        guessed = tuple(name for name, value in zip(space.free, start, strict=True) if np.isnan(value))
+        known, appraised = Appraisal.before(space.free, np.where(np.isnan(start), default, start)), []
+        if result is not None and done and examination is not None:
+            known = Appraisal(known.names, result.best.point, examination.uncertainty)
+            appraised = list(result.trials)
+        with closing(self._make_simulator(options)) as simulator, closing(Threads(1)) as thread:
+            pool = Pool(simulator, thread, should_stop)
+            for k, key in new:
+                trial, fresh = trials[k], key not in informations
+                reasons = implausible(trial, height, bool(options.scene)) if fresh else ()
+                if reasons:  # information from it would be wrong
+                    informations[key] = reasons[0]
+                elif fresh:
+                    try:
+                        informations[key] = Appraiser(
+                            space, pool, mean_length(trials), height, noise(trials), guessed).after(
+                            known, [*appraised, trial])
+                    except CancelledError:
+                        raise
+                    except Exception as error:  # of the engine
+                        informations[key] = one_line(error)
+                appraisal = informations[key]
+                if isinstance(appraisal, str):
+                    added = TrialInformation.unknown(trial.name, known.names, appraisal)
+                else:
+                    added = TrialInformation(trial.name, known.names, known.uncertainty.std,
+                                             appraisal.uncertainty.std, appraisal.uncertainty.verdicts)
+                    known, appraised = appraisal, [*appraised, trial]
+                if fresh:
+                    put(added)
+
+
+def fingerprints(trials: Sequence[Trial]) -> list[tuple[str, int]]:
+    """Return a digest of each trial without its name, and a number that distinguishes equal trials."""
+    counts: Counter[str] = Counter()
+    numbered = []
+    for trial in map(without_repeated_goals, trials):
+        text = digest(trial.initial.points, trial.velocity, trial.hands,
+                      [(goal.time, goal.stable, goal.held_by) for goal in trial.goals])
+        numbered.append((text, counts[text]))
+        counts[text] += 1
+    return numbered

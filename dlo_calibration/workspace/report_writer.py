@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 The dlo_calibration authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The page of a result: pictures are drawn in a process of their own; on the node, in the background, too."""
+
+from __future__ import annotations
+
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from importlib import import_module
+from multiprocessing import get_context, parent_process
+import os
+from pathlib import Path
+import signal
+import threading
+from typing import Callable, Iterator
+
+from dlo_calibration.calibration.engines import SimulatorFactory
+from dlo_calibration.calibration.result import CalibrationResult
+from dlo_calibration.calibration.stages import sliced
+from dlo_calibration.errors import DloCalibrationError
+from dlo_calibration.report.page import Origin, page_of
+from dlo_calibration.writing import reason, write_file
+
+PATIENCE = 10.0  # s; whoever ends the node does not wait longer
+
+
+def write_report(path: Path, result: CalibrationResult, origin: Origin, make_simulator: SimulatorFactory,
+                 should_stop: Callable[[], bool], niceness: int = 0) -> None:
+    """
+    Write the page of a result, with slices that are simulated here.
+
+    Its pictures are drawn in another process: while Matplotlib draws in a thread, a service of the node or
+    the capture page may wait for more than 0.1 s.
+
+    :param should_stop: once it returns true, the page gets no more slices.
+    :param niceness: how far drawing gives way to other processes, as `os.nice`.
+    :raises DloCalibrationError: if the page cannot be drawn or written.
+    """
+    try:
+        with ProcessPoolExecutor(1, get_context('spawn'), _end_with_parent, (niceness,)) as process:
+            process.submit(import_module, 'matplotlib.figure')  # loading it takes as long as the slices
+            slices = sliced(result, origin.options, make_simulator, should_stop)
+            page = process.submit(page_of, result, origin, slices).result()
+    except BrokenExecutor as error:
+        raise DloCalibrationError('the process that draws it was ended from outside') from error
+    write_file(path, page)
+
+
+class ReportWriter:
+    """
+    Writes pages in a thread, one after the other; it collects errors instead of raising them.
+
+    :param make_simulator: called in that thread, for the slices.
+    """
+
+    def __init__(self, make_simulator: SimulatorFactory) -> None:
+        self._make_simulator = make_simulator
+        self._stop = threading.Event()
+        self._thread = ThreadPoolExecutor(1, 'report')
+        self._pages: list[tuple[Path, Future[None]]] = []
+
+    def begin(self, path: Path, result: CalibrationResult, origin: Origin, older: Path | None = None) -> None:
+        """
+        Begin to write a page; returns at once.
+
+        :param older: where to move an older page with this path, even one that is still being written.
+        """
+        self._pages.append((path, self._thread.submit(self._write, path, result, origin, older)))
+
+    def failures(self) -> Iterator[tuple[Path, str]]:
+        """Yield each page that could not be written since the last call, and the reason."""
+        pages, self._pages = self._pages, []
+        for path, future in pages:
+            if future.done() and not future.cancelled():
+                error = future.exception()
+                if isinstance(error, Exception):
+                    yield path, reason(error)
+            elif self._stop.is_set():
+                yield path, f'it was not ready {PATIENCE:.0f} s after the end'
+            else:
+                self._pages.append((path, future))
+
+    def close(self) -> None:
+        """End the simulations, and wait until the pages are written, at most `PATIENCE`."""
+        self._stop.set()
+        wait([future for _, future in self._pages], PATIENCE)
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _write(self, path: Path, result: CalibrationResult, origin: Origin, older: Path | None) -> None:
+        if older is not None and path.exists():
+            path.replace(older)
+        write_report(path, result, origin, self._make_simulator, self._stop.is_set, 5)
+
+
+def _end_with_parent(niceness: int) -> None:
+    """Leave signals to the parent, and end with it, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(niceness)
+    threading.Thread(target=_wait_for_its_end, daemon=True).start()
+
+
+def _wait_for_its_end() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
